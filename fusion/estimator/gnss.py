@@ -15,6 +15,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
+from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE, DriftWatch
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
@@ -115,6 +116,8 @@ class GnssUpdater:
         self.plausible = FixPlausibility()
         self._report = report
         self._seen = 0
+        self.drift_watch = DriftWatch(self.drift_sigma_m, self.drift_time_s)
+        self._share = 0.0
 
     def queue(self, fix: GnssFix) -> None:
         """Take a fix in, in any order of time."""
@@ -155,6 +158,8 @@ class GnssUpdater:
         keyframe.
         """
         used = False
+        if self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise):
+            covariance = chain.covariance_at(chain.last)
         self.track.step(chain, self.skid.rate_m2ps > 0.0)
         self.plausible.watch(chain.nodes[-1].t_ns)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
@@ -183,6 +188,7 @@ class GnssUpdater:
                 used |= self._add_fix(chain, k, fix, covariance, noise)
                 if self._pair is None or self._pair.usable:
                     self._unchecked = fix
+        self.drift_watch.fresh = used and self._share >= LEAST_SHARE
         if used:
             self.weighting.revisit(chain)
         return used
@@ -270,6 +276,7 @@ class GnssUpdater:
         if first or step is None:
             return False
         chain.revise(k, step.restarted(slice(1, 3)))
+        self.drift_watch.restart()
         return True
 
     def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:
@@ -310,7 +317,7 @@ class GnssUpdater:
     ) -> bool:
         state, at = chain.state(k), AntennaMotion.of(chain, k, fix, self.antenna_m)
         inflation = noise.gnss_inflation * self.scale
-        share = self._drift_share(fix, inflation)
+        share = self._share = self._drift_share(fix, inflation)
         # The fix is carried to its keyframe by the speed as it is known now.
         carried_m = abs(at.offset_s) * math.sqrt(
             0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2]))

@@ -33,6 +33,8 @@ MEMORY_S = 10.0
 """Time constant of the variance rate while the robot drives and fixes are accepted (assumed: a few turns)."""
 FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
+COARSE_M2 = 1.0
+"""Variance of a fix, both axes, that tells little of a skid: .7 m each (assumed)."""
 DRIVING_MPS = 0.3
 """Speed, of the robot or its wheels, at which half of the time counts as driven; at rest none does."""
 
@@ -143,14 +145,15 @@ class SkidDetector:
         """Adapt the rate to a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
 
         Wheels that are trusted too much leave innovations on one side; the innovations of the right filter
-        are white.
+        are white. Coarse fixes say nothing of a rate that adds up to less than their variance.
         """
         before_ns = self._last_ns
         if before_ns is not None and t_ns <= before_ns:
             return
         self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
         before_m, self._before_m = self._before_m, innovation_m
-        if self.rate_m2ps and driven_s > 0.0:
+        telling = float(np.sum(predicted_m2)) <= max(2.0 * self.rate_m2ps * MEMORY_S, COARSE_M2)
+        if self.rate_m2ps and driven_s > 0.0 and telling:
             more_m2 = 0.5 * min(float(innovation_m @ before_m), float(np.sum(innovation_m**2 - predicted_m2)))
             beyond = more_m2 / driven_s
             rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond

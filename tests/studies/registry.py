@@ -40,7 +40,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "outage_terms", "known_changes", "grounds", "fault_matrix",
+    "outage_terms", "known_changes", "grounds", "fault_matrix", "coarse_slides",
 )  # fmt: skip
 
 
@@ -208,6 +208,16 @@ STUDIES = (
             for seconds in (10, 30, 60)
         },
         "opponents.png",
+    ),
+    Study(
+        "coarse_slides",
+        "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
+        _module("coarse_slides"),
+        5,
+        {
+            "judged": r"judged: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
+            "developed": r"developed: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
+        },
     ),
     Study(
         "outage_terms",

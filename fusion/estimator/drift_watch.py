@@ -1,0 +1,85 @@
+"""Whether the receiver's drift, as the graph has it, moves faster than a receiver drifts.
+
+Fixes of a stand-alone receiver are too coarse for the gate to refuse them when the wheels slide. What the
+wheels then get wrong goes into the drift state, which keeps it for a minute or more. In a consistent filter
+the estimate of a Gauss-Markov state d with sigma s and time constant T moves in the time t by
+
+    d(t) - a d(0) ,  a = exp(-t / T) ,  covariance  a^2 P(0) + s^2 (1 - a^2) - P(t) ,
+
+with P its covariance (increments of a conditional mean; Gelb 1974, Applied Optimal Estimation, ch. 4.2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.estimator.skid import SkidDetector
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import DRIFT, NAV
+from terrafusion.fusion.noise.policy import SensorNoise
+
+WINDOW_S = 5.0
+"""Over which a move is judged: a skid lasts a second or two, the smoothing window is as long (assumed)."""
+LIMIT = float(chi2.ppf(0.95, 2))
+"""Of the normalised square. The covariance taken is an upper bound: beside wheels that lose .1 m/sqrt(s) a
+receiver passes it in one of ten drives of two minutes. The wheels then count less for some seconds."""
+LEAST_SHARE = 0.5
+"""Share of the drift state from which fixes show it: those of RTK do not."""
+
+
+@dataclass
+class DriftWatch:
+    """The newest estimates of the drift.
+
+    Attributes:
+        sigma_m, time_s: of the drift's Gauss-Markov process.
+        fresh: fixes that show the drift came into the graph since the last test.
+        seen: time, drift (2,), m, and mean variance of it, m2.
+    """
+
+    sigma_m: float
+    time_s: float
+    fresh: bool = False
+    seen: list[tuple[int, Array, float]] = field(default_factory=list)
+
+    def test_wheels(self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise) -> bool:
+        """Refute the wheels where the drift moved too far; True where it did. `sigma_m` is that of a fix."""
+        if not self.fresh:
+            return False
+        drift_m = np.array(chain.state(chain.last).linear[DRIFT.start - NAV.stop : DRIFT.stop - NAV.stop])
+        variance_m2 = 0.5 * float(np.trace(chain.covariance_at(chain.last)[DRIFT, DRIFT]))
+        moved = self.moved_too_far(chain.nodes[-1].t_ns, drift_m, variance_m2)
+        if moved is None:
+            return False
+        since_ns, moved_m = moved
+        if not skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
+            return False
+        self.restart()
+        return True
+
+    def moved_too_far(self, t_ns: int, drift_m: Array, variance_m2: float) -> tuple[int, Array] | None:
+        """Take an estimate in; since when and how far, (2,) m, it moved faster than a receiver drifts.
+
+        None where it did not.
+        """
+        self.seen = [one for one in self.seen if 0 < t_ns - one[0] <= WINDOW_S * 1e9]
+        found = None
+        for before_ns, before_m, before_m2 in self.seen:
+            kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
+            new_m2 = self.sigma_m**2 * (1.0 - kept**2)
+            moved_m = drift_m - kept * before_m
+            allowed_m2 = max(kept**2 * before_m2 + new_m2 - variance_m2, new_m2)
+            if float(moved_m @ moved_m) > LIMIT * allowed_m2:
+                found = before_ns, moved_m
+                break
+        self.seen.append((t_ns, drift_m, variance_m2))
+        return found
+
+    def restart(self) -> None:
+        """Forget what was seen: the drift state is new."""
+        self.seen.clear()
