@@ -61,7 +61,7 @@ STUDIES = (
     ),
     Study(
         "fuzz",
-        "Does any input of readers, YAML, live API or command line end in a crash, a hang or too much memory?",
+        "Does any input of readers, YAML, live API or command line end in a crash or a hang?",
         _module("fuzz", "--readers", "2000", "--yaml", "2000", "--live", "1000", "--cli", "1000"),
         40,
         {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
@@ -70,7 +70,7 @@ STUDIES = (
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
         _module("fault_matrix.matrix", "--out", OUT),
-        25,
+        20,
         {
             "cells": r"cells (\d+)",
             **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
@@ -147,7 +147,7 @@ STUDIES = (
         "twin_field",
         "Does the twin predict measured drives better than kinematic models?",
         _module("twin_field.compare_drives", DATA, "--out", OUT),
-        25,
+        20,
     ),
     Study(
         "survey",

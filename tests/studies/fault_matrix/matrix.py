@@ -1,6 +1,6 @@
 """A matrix of faults: does the estimator, or its verdict, fail silently?
 
-    python -m tests.studies.fault_matrix.matrix --cells 1000 --seconds 1500 --out OUT
+    python -m tests.studies.fault_matrix.matrix --cells 1000 --seconds 1200 --out OUT
 
 A cell is one or two faults, a log, a mode and live or batch, drawn at random with a seed: cell i is the same
 in every run, and a run goes on where one was stopped. The truth is kept from the verdict; where a log has
@@ -238,7 +238,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--cells", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=1500.0, help="stop after so long")
+    parser.add_argument("--seconds", type=float, default=1200.0, help="stop after so long")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
