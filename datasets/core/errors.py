@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from terrafusion.datasets.core.printable import printable
+
 
 class TerrafusionError(Exception):
     """A known problem with an input or a request, in one line.
@@ -41,7 +43,7 @@ class TerrafusionError(Exception):
         message = f"{', '.join(where)}: {what}" if where else what
         if remedy:
             message = f"{message}; {remedy}"
-        super().__init__(" ".join(message.split()))
+        super().__init__(printable(" ".join(message.split())))
 
 
 class DataError(TerrafusionError):

@@ -12,7 +12,8 @@ import numpy as np
 
 def to_json(value: Any, *, indent: int | None = None) -> str:
     """`value` as strict JSON: never NaN or Infinity."""
-    return json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", "backslashreplace").decode()  # half of a surrogate pair is \\udXXX
 
 
 def finite(value: Any) -> Any:

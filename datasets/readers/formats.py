@@ -113,6 +113,9 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
             raise DataError("no such file or folder", file=path, remedy="check the path")
         if not (path.is_dir() or path.is_file()):
             raise DataError("is neither a file nor a folder", file=path, remedy="give a log")
+        for inner in path.iterdir() if path.is_dir() else ():  # to open a pipe would wait for its writer
+            if inner.exists() and not (inner.is_dir() or inner.is_file()):
+                raise DataError("is neither a file nor a folder", file=inner, remedy="remove it from the log")
         head = b""
         if path.is_file():
             with path.open("rb") as file:

@@ -151,6 +151,11 @@ class _Folder:
             raise DataError(
                 f"both {plain.name} and {packed.name} exist", file=self.folder, remedy="keep one of them"
             )
+        for path in (plain, packed):
+            if path.is_symlink() and not path.exists():
+                raise DataError("is a link to nothing", file=path, remedy="mend the link, or remove it")
+            if path.exists() and not path.is_file():
+                raise DataError("is no file", file=path, remedy="give a CSV file, or remove it")
         return plain if plain.exists() else packed if packed.exists() else None
 
     def strangers(self) -> Iterator[str]:

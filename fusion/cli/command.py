@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli.common import PROGRESS
 from terrafusion.fusion.cli.outputs import Output, check_file
 
@@ -153,7 +154,7 @@ def show(result: Result, quiet: bool, verbose: bool, as_json: bool) -> None:
     lines = [result.short or result.done] if quiet else [*result.lines, *details, result.done]
     lines = [result.done] if as_json else lines  # the rest is in the document
     for line in lines if lines[-1] else lines[:-1]:
-        print(line, file=sys.stderr if as_json else sys.stdout)
+        print(printable(line), file=sys.stderr if as_json else sys.stdout)
     if as_json:
         print(json.dumps(result.document, indent=2, allow_nan=False))
 

@@ -7,12 +7,14 @@ Heavy packages are imported inside the command that needs them, so that
 from __future__ import annotations
 
 import errno
+import io
 import sys
 from typing import Annotated
 
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli import (
     allan,
     benchmark,
@@ -91,6 +93,9 @@ app.add_typer(policy.app, name="policy")
 
 def main() -> None:
     """Run the command line: 0 done, 1 a known error in one line, 2 wrong usage, 130 Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a locale may lack what is printed
+            stream.reconfigure(errors="backslashreplace")
     completion.answer_shells()
     try:
         status = app(prog_name="terrafusion", standalone_mode=False)
@@ -98,7 +103,7 @@ def main() -> None:
             print("error: interrupted; nothing was written", file=sys.stderr)
         sys.exit(status)
     except UsageError as error:
-        print(f"error: {usage_line(error)}", file=sys.stderr)
+        print(f"error: {printable(usage_line(error))}", file=sys.stderr)
         sys.exit(2)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)

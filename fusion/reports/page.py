@@ -59,7 +59,7 @@ def write_text(path: Path, text: str) -> Path:
     Raises:
         TerrafusionError: the file cannot be written.
     """
-    return write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    return write_atomically(path, lambda part: part.write_text(text, "utf-8", "backslashreplace"))
 
 
 def write_png(path: Path, fig: Figure, dpi: int = 150) -> Path:
