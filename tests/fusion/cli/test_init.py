@@ -113,6 +113,9 @@ def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: P
     jsonschema.validate({"robot": robot}, schema)
     vehicle = load_vehicle(out)
     assert (vehicle.name, vehicle.body.mass_kg, vehicle.sensors.imu.axes) == ("own", 32.0, HUSKY)
+    again = open_recording(bag, rig=vehicle.rig())  # the file holds the topic, too
+    assert again.imu is not None
+    np.testing.assert_allclose(again.imu.accel_mps2.mean(axis=0), (0.0, 0.0, 9.8), atol=0.2)
     assert "assumed   drive = skid_steer" in done.output
     assert "verdict: " in done.output
     assert done.output.splitlines()[-1].startswith(f"next: terrafusion replay {bag} --vehicle {out}")
