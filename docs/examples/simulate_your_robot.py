@@ -6,6 +6,7 @@ python docs/examples/simulate_your_robot.py --vehicle my_robot.yaml
 import argparse
 
 import numpy as np
+
 import terrafusion as tf
 
 parser = argparse.ArgumentParser()
