@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.fusion.cli.usage import SHARED
+
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
     from terrafusion.datasets.core.recording import Recording
@@ -50,8 +52,6 @@ RepairClockOption = Annotated[
     bool,
     typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log."),
 ]
-
-UNNAMED = ("--quiet", "-q", "--verbose", "--json", "--force")
 
 
 def parse_topics(entries: list[str] | None) -> dict[str, str]:
@@ -180,7 +180,7 @@ def command_line() -> str:
     for word in words:
         if word == "--out":
             next(words, None)
-        elif word not in UNNAMED and not word.startswith("--out="):
+        elif word not in SHARED and not word.startswith("--out="):
             kept.append(word)
     return shlex.join(kept)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
@@ -12,6 +14,7 @@ from terrafusion.fusion.cli.common import (
     StampsOption,
     TopicOption,
     VehicleOption,
+    command_line,
     load_rig,
     reading,
     rig_of,
@@ -24,6 +27,9 @@ def inspect(
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE.html", help="Also write this as a page.")
+    ] = None,
 ) -> Result:
     """Show the contents of a log, measures between its channels, and the findings of the log checks.
 
@@ -49,9 +55,13 @@ def inspect(
     reading(None, topic, stamps, columns, repair_clock=True)  # reports wrong usage for any kind of log
     trials = trials_of(log) if columns is None else None
     page = trials or inspected(log, vehicle, topic, stamps, columns)
-    return Result(
-        styled_lines(trials_lines(page) if trials else page_lines(page)), "", page, int(_has_errors(page))
-    )
+    lines = list(trials_lines(page) if trials else page_lines(page))
+    if report is not None:
+        from terrafusion.fusion.reports.inspect import write_inspection
+
+        write_inspection(report, page, [text for _, text in lines], command_line())
+    done = "" if report is None else f"report: {report}"
+    return Result(styled_lines(lines), done, page, int(_has_errors(page)))
 
 
 def _has_errors(page: dict[str, Any]) -> bool:

@@ -69,7 +69,7 @@ def options(
 
 add_command(app, "demo", demo.demo, output=demo.OUTPUT)
 add_command(app, "init", init.init, files={"out": None}, as_json=False)
-add_command(app, "inspect", inspect.inspect)
+add_command(app, "inspect", inspect.inspect, files={"report": "terrafusion inspect"})
 add_command(app, "fetch", fetch.fetch)
 add_command(app, "convert", convert.convert, output=convert.OUTPUT)
 add_command(app, "simulate", simulate.simulate, output=simulate.OUTPUT)

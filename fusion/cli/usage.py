@@ -12,6 +12,9 @@ from typer.core import TyperGroup
 UsageError: Any = typer.BadParameter.__base__
 """What typer raises for wrong usage; which module it comes from depends on typer's version."""
 
+SHARED = ("--quiet", "-q", "--verbose", "--json", "--force")
+"""Options that commands share."""
+
 
 class CommandGroup(TyperGroup):
     """A group of commands that shows its help without words, and the nearest name for an unknown one."""
@@ -45,5 +48,8 @@ def usage_line(error: Any) -> str:
     if type(error).__name__ == "NoSuchOption":
         parameters = context.command.get_params(context)
         known = [name for one in parameters for name in (*one.opts, *one.secondary_opts) if name[0] == "-"]
-        text = f"there is no option {error.option_name}{nearest(error.option_name, known)}"
+        name = error.option_name
+        text = f"there is no option {name}{nearest(name, known)}"
+        if name in SHARED and context.parent is None:
+            text = f"{name} stands behind the command"
     return f"{' '.join(text.split())} (see `{context.command_path} --help`)"

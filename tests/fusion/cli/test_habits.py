@@ -158,6 +158,13 @@ def test_inspect_fails_where_a_finding_is_an_error(here: Path, good_log: Path, t
     done = terrafusion("inspect", "log", "--json")
     assert (done.status, done.err) == (1, "")
     assert any(finding["severity"] == "error" for finding in json.loads(done.out)["findings"])
+    for _ in range(2):
+        assert terrafusion("inspect", "log", "--report", "log.html").out.endswith("report: log.html\n")
+    page = (here / "log.html").read_text()
+    assert "beyond anything possible" in page
+    assert "gyro_z_radps" in page
+    (here / "mine.html").write_text("mine")
+    assert terrafusion("inspect", "log", "--report", "mine.html").refused("mine.html", "exists", "--force")
 
 
 def test_progress_is_lines_in_a_pipe_where_asked_for(

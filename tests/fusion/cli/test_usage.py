@@ -19,6 +19,7 @@ import pytest
         ("inspect x --jsn", ("no option --jsn", "did you mean --json?")),
         ("--versoin", ("no option --versoin", "did you mean --version?")),
         ("replay x --out y --mode magic", ("--mode", "'magic'", "adaptive")),
+        ("--quiet inspect x", ("--quiet stands behind the command",)),
         ("inspect", ("LOG", "terrafusion inspect --help")),
     ],
 )
