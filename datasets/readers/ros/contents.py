@@ -70,7 +70,8 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
     for topic in usable:
         stream = streams[topic.name, topic.msgtype]
         t_ns = stream.receipt_ns if stream.header_ns is None else stream.header_ns
-        contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
+        if len(t_ns):  # the index of a bag may count messages that are not there
+            contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in there if topic not in usable)
     return BagContents(tuple(contents), unused, rivals)
 
