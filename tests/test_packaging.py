@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -84,3 +85,18 @@ def test_the_version_is_told() -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout == f"terrafusion {metadata.version('terrafusion')}\n"
+
+
+def test_the_release_is_the_same_everywhere() -> None:
+    """Citation, ROS package and the newest release of the changelog, with its date."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    newest = re.search(r"^## \[(\d[^\]]*)\] - (\S+)$", changelog, re.MULTILINE)
+    assert newest is not None
+    assert newest[1] == version
+    assert f"\nversion: {version}\n" in citation
+    assert f"\ndate-released: {newest[2]}\n" in citation
+    ros = ROOT / "docs" / "ros2" / "terrafusion_ros"
+    assert f"<version>{version}</version>" in (ros / "package.xml").read_text()
+    assert f'version="{version}"' in (ros / "setup.py").read_text()
