@@ -181,8 +181,7 @@ class EffectSearch:
         """With the most probable further effect; None where none is required.
 
         What an effect explains of the whole gap says little: a small one shows beside a large one by how much
-            it
-        reduces the rest.
+        it reduces the rest.
         """
         most = min((1.0 - FURTHER_SHARE) * found.left.total, found.left.total - FURTHER_LEFT)
         if most < 0.0:  # nothing can leave less than zero

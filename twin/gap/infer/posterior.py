@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 SIZES = (0.1, 0.3, 1.0, 3.0, 10.0)  # 1 sigma of an effect's size, in typical sizes; equal weights
 WIDE = 10.0  # 1 sigma of an effect's size where it is fitted: the data decide
 UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
-UNKNOWN_PRIOR = 0.1  # prior probability that a gap has a cause outside the catalogue (assumed)
 DISCREPANCY_SIGMA = 0.1  # 1 sigma of the model discrepancy, in the effect's size (tuned on twin trials)
 
 
@@ -191,17 +190,11 @@ class PooledScores:
 
 @dataclass(frozen=True, eq=False)
 class BayesFactors:
-    """Log Bayes factors against the null: by effect, its best form, by form, and of an unknown cause."""
+    """Log Bayes factors against the null: by effect, its best form, and by form."""
 
     effects: dict[str, float]
     best: dict[str, Hypothesis]
     forms: dict[tuple[str, str], float]
-    unknown: float
-
-    def statistic(self) -> float:
-        """Log Bayes factor of any gap against none."""
-        known = np.logaddexp.reduce(list(self.effects.values())) - np.log(len(self.effects))
-        return float(np.logaddexp(known + np.log1p(-UNKNOWN_PRIOR), self.unknown + np.log(UNKNOWN_PRIOR)))
 
 
 def bayes_factors(pooled: PooledScores, candidates: Candidates, given: Sequence[int] = ()) -> BayesFactors:
@@ -225,9 +218,7 @@ def bayes_factors(pooled: PooledScores, candidates: Candidates, given: Sequence[
     for name in best:
         mine = [v for (effect, _), v in forms.items() if effect == name]
         effects[name] = float(np.logaddexp.reduce(mine) - np.log(len(mine)))
-    nuisance = range(len(candidates.keys), pooled.own)
-    unknown = pooled.log_factor([*given, *nuisance], UNKNOWN_SIZES) - base
-    return BayesFactors(effects, best, forms, unknown)
+    return BayesFactors(effects, best, forms)
 
 
 def _one_sided(pooled: PooledScores, h: Hypothesis, candidates: Candidates) -> float:
