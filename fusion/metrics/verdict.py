@@ -60,7 +60,7 @@ SIGMA_KNOWN_M, YAW_SIGMA_KNOWN_RAD = 10.0, 0.5
 """Position and heading are unknown for navigation beyond these 1 sigmas."""
 REPORTED = (
     "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
-    "sigma-too-small", "standing",
+    "sigma-too-small", "standing", "saturated",
 )  # fmt: skip
 """Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
 the estimator estimates itself, such as small scale errors and delays, or cost accuracy only."""

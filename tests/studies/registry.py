@@ -62,8 +62,8 @@ STUDIES = (
     Study(
         "fuzz",
         "Does any input of readers, YAML, live API or command line end in a crash or a hang?",
-        _module("fuzz", "--readers", "2000", "--yaml", "2000", "--live", "1000", "--cli", "1000"),
-        40,
+        _module("fuzz", "--readers", "250", "--yaml", "600", "--live", "100", "--cli", "60"),
+        3,
         {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
     ),
     Study(

@@ -200,3 +200,15 @@ def test_a_fault_is_not_good(fault):
         far |= wrong
         assert run.verdict.value != "good", run.verdict
     assert far or fault != "gyro sign"
+
+
+def test_a_gyro_at_the_end_of_its_range_is_not_good_even_where_nothing_else_shows_it():
+    from terrafusion.fusion.replay import replay
+
+    log = dataclasses.replace(short_drive(402), truth=None)
+    assert log.imu is not None
+    most = 0.5 * float(np.abs(log.imu.gyro_radps[:, 2]).max())
+    clipped = dataclasses.replace(log.imu, gyro_radps=np.clip(log.imu.gyro_radps, -most, most))
+    run = replay(dataclasses.replace(log, imu=clipped), settings={"self_calibrate": False})
+    assert run.verdict.value == "doubtful"
+    assert "end of a range" in " ".join(run.verdict.reasons)
