@@ -35,7 +35,7 @@ class Result:
         document: what `--json` prints.
         status: exit status.
         details: printed with `--verbose`.
-        short: printed with `--quiet`; by default `done`.
+        short: printed with `--quiet` and `--json`; by default `done`.
         vehicle: `VehicleParams` of the run, for `config.json`.
     """
 
@@ -151,8 +151,8 @@ def _told(quiet: bool, as_json: bool) -> Iterator[None]:
 def show(result: Result, quiet: bool, verbose: bool, as_json: bool) -> None:
     """Print a result; with `as_json` its document alone is on standard output."""
     details = result.details if verbose else ()
-    lines = [result.short or result.done] if quiet else [*result.lines, *details, result.done]
-    lines = [result.done] if as_json else lines  # the rest is in the document
+    short = [result.short or result.done]  # with `--json`, the rest is in the document
+    lines = short if quiet or as_json else [*result.lines, *details, result.done]
     for line in lines if lines[-1] else lines[:-1]:
         print(printable(line), file=sys.stderr if as_json else sys.stdout)
     if as_json:

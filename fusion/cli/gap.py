@@ -129,7 +129,8 @@ def gap(
     written = write_vehicle if changes and found.verdict.named else None
     told = answer(found, out, written)
     document = read_json(out / "diagnosis.json")
-    return Result([*compared, *told[:-1]], told[-1], document, details=[*changes, *details(found)])
+    more, short = [*changes, *details(found)], f"{told[0]}; written to {out}"
+    return Result([*compared, *told], "", document, details=more, short=short)
 
 
 def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:

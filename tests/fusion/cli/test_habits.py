@@ -89,6 +89,9 @@ def test_quiet_is_one_line(here: Path, good_log: Path, terrafusion) -> None:
     done = terrafusion("replay", good_log, "--quiet", "--out", "out")
     assert (done.status, done.err) == (0, "")
     assert re.fullmatch(r"verdict: \w+; written to out\n", done.out)
+    gap = terrafusion("gap", good_log, "--effects", "wheel_radius", "--quiet", "--out", "gap")
+    assert (gap.status, gap.err, gap.out.count("\n")) == (0, "", 1)
+    assert gap.out.endswith("; written to gap\n")
     assert terrafusion("replay", "gone.bag", "--quiet").refused("gone.bag")
 
 
