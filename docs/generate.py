@@ -102,7 +102,7 @@ def schemas_page() -> str:
         lines += [
             f"## {name}",
             "",
-            found.get("description", ""),
+            described(found)[0],
             "",
             f"[{path.name}](../schemas/{path.name})",
             "",
@@ -110,16 +110,32 @@ def schemas_page() -> str:
         parts = [("", found), *found.get("$defs", {}).items()]
         for part, schema in parts:
             if schema.get("properties"):
-                lines += [f"### {name}: {part}", "", schema.get("description", ""), ""] if part else []
+                lines += [f"### {name}: {part}", "", described(schema)[0], ""] if part else []
                 lines += table(("key", "type", "meaning"), list(key_rows(schema)))
     return "\n".join(lines)
 
 
+def described(schema: dict[str, Any]) -> tuple[str, dict[str, str]]:
+    """A schema's description without the list of its attributes, and the meaning of each attribute."""
+    text, _, listed = schema.get("description", "").partition("Attributes:")
+    listed, *_ = re.split(r"\n(?:\n|Raises:|Returns:)", listed.strip("\n"))
+    said: dict[str, str] = {}
+    names: list[str] = []
+    for line in listed.splitlines():
+        started = re.match(r"\s*(\w+(?:, \w+)*): (.*)", line)
+        words = started[2] if started else line.strip()
+        names = started[1].split(", ") if started else names
+        for name in names:
+            said[name] = f"{said.get(name, '')} {words}".strip()
+    return text.strip(), said
+
+
 def key_rows(schema: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Key, type and meaning of each property; required keys are bold."""
+    _, said = described(schema)
     for key, value in schema["properties"].items():
         name = f"**`{key}`**" if key in schema.get("required", ()) else f"`{key}`"
-        meaning = [value.get("description", "")]
+        meaning = [said.get(key, ""), value.get("description", "")]
         if value.get("default") not in (None, {}, []):
             meaning.append(f"Default `{json.dumps(value['default'])}`.")
         yield name, type_name(value), " ".join(filter(None, meaning))

@@ -61,6 +61,8 @@ def test_schemas_and_effects_are_whole(site: Path) -> None:
         assert path.name in schemas
         assert (site / "schemas" / path.name).is_file()
     assert "wheel_radius_m" in schemas
+    assert "sensor axes that point along body x" in schemas
+    assert "Attributes:" not in schemas
     effects = words_of(site / "reference" / "all-effects.html")
     for form in catalogue.built_in().values():
         assert " ".join(form.equation.replace("`", "").split()) in " ".join(effects.split()), form.key
