@@ -57,8 +57,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "
             "otherwise: the wheels stood in for it"
         )
-    for name, count in estimator.newest.refused.items():
-        notes.append(f"{count} samples of {name} lay far ahead of IMU and wheels: they were left out")
+    for channel, ahead in estimator.newest.refused.items():
+        notes.append(f"{ahead} samples of {channel} lay far ahead of IMU and wheels: they were left out")
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.leap.dropped:
             notes.append(
