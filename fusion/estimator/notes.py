@@ -50,8 +50,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             "over ten samples the counters"
         )
     if jumps := estimator.wheels.jumps:
-        times = "once" if jumps == 1 else f"{jumps} times"
-        notes.append(f"wheels: the counters jumped {times}; there the speeds gave the distance")
+        often = "once" if jumps == 1 else f"{jumps} times"
+        notes.append(f"wheels: the counters jumped {often}; there the speeds gave the distance")
     if estimator.gyro.samples:
         notes.append(
             f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "
