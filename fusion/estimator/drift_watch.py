@@ -28,6 +28,8 @@ WINDOW_S = 5.0
 LIMIT = float(chi2.ppf(0.95, 2))
 """Of the normalised square. The covariance taken is an upper bound: beside wheels that lose .1 m/sqrt(s) a
 receiver passes it in one of ten drives of two minutes. The wheels then count less for some seconds."""
+MOST_YAW_RAD = 0.15
+"""Sigma of the heading beyond which it, not the wheels, may have led astray (assumed)."""
 LEAST_SHARE = 0.5
 """Share of the drift state from which fixes show it: those of RTK do not."""
 
@@ -52,9 +54,9 @@ class DriftWatch:
         if not self.fresh:
             return False
         drift_m = np.array(chain.state(chain.last).linear[DRIFT.start - NAV.stop : DRIFT.stop - NAV.stop])
-        variance_m2 = 0.5 * float(np.trace(chain.covariance_at(chain.last)[DRIFT, DRIFT]))
-        moved = self.moved_too_far(chain.nodes[-1].t_ns, drift_m, variance_m2)
-        if moved is None:
+        P = chain.covariance_at(chain.last)
+        moved = self.moved_too_far(chain.nodes[-1].t_ns, drift_m, 0.5 * float(np.trace(P[DRIFT, DRIFT])))
+        if moved is None or P[2, 2] > MOST_YAW_RAD**2:
             return False
         since_ns, moved_m = moved
         if not skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):

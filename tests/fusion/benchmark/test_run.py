@@ -240,6 +240,6 @@ def test_the_command(terrafusion, one_job, tmp_path) -> None:
     assert done.status == 0, done.err
     assert "## Errors" in done.out
     assert "outages, twin" in done.out
-    assert terrafusion("benchmark", "--out", tmp_path, "--only", "nothing").refused(
+    assert terrafusion("benchmark", "--out", tmp_path / "other", "--only", "nothing").refused(
         "unknown family 'nothing'"
     )

@@ -221,7 +221,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "empty table": (text_of("wheels.csv", ""), ("wheels.csv", "empty", "header")),
     "a table that is a folder": (
         lambda log: [(log / "imu.csv").unlink(), (log / "imu.csv").mkdir()],
-        ("imu.csv", "cannot be read"),
+        ("imu.csv", "is no file"),
     ),
 }
 
