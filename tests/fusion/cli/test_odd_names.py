@@ -75,7 +75,7 @@ def test_a_link_to_nothing_is_no_absent_channel(good_log: Path, tmp_path: Path, 
     log = copied(good_log, "log", tmp_path)
     (log / "gnss.csv").unlink()
     (log / "gnss.csv").symlink_to("/nowhere/gnss.csv")
-    terrafusion("inspect", log).refused("gnss.csv", "link to nothing")
+    assert terrafusion("inspect", log).refused("gnss.csv", "link to nothing")
 
 
 @pytest.mark.parametrize("name", ["gnss.csv", "strange"])
@@ -83,4 +83,4 @@ def test_a_pipe_in_a_log_is_not_waited_for(name: str, good_log: Path, tmp_path: 
     log = copied(good_log, "log", tmp_path)
     (log / name).unlink(missing_ok=True)
     os.mkfifo(log / name)
-    terrafusion("inspect", log).refused(name, "neither a file nor a folder")
+    assert terrafusion("inspect", log).refused(name, "neither a file nor a folder")
