@@ -18,6 +18,24 @@ BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, RuntimeError)
 """What NumPy, GTSAM and the elimination raise where a system has no solution."""
 
 
+class CallbackError(Exception):
+    """An error of a callback of the caller: it says nothing of the sensors."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(error)
+        self.error = error
+
+
+def call_back(callback: Callable[[Any], None] | None, value: Any) -> None:
+    """Call a callback of the caller; its errors pass `starts_anew` as they are."""
+    if callback is None:
+        return
+    try:
+        callback(value)
+    except BREAKDOWN as error:
+        raise CallbackError(error) from error
+
+
 def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
     """A method that makes keyframes, guarded: where the numbers break down, the estimator starts anew.
 
@@ -33,6 +51,8 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
             state = estimator.latest()
             if state is not before and not np.isfinite(state.covariance.sum() + state.position_m.sum()):
                 raise ArithmeticError("a state is not finite")
+        except CallbackError as passed:
+            raise passed.error from None
         except BREAKDOWN:
             count = estimator.breakdowns + 1
             estimator.__init__(estimator.config, estimator._on_state, estimator._on_innovation)

@@ -27,7 +27,7 @@ from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
 from terrafusion.fusion.estimator.alignment import Start, checked_start, initial_state
-from terrafusion.fusion.estimator.breakdown import starts_anew
+from terrafusion.fusion.estimator.breakdown import call_back, starts_anew
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
@@ -440,10 +440,10 @@ class Estimator:
             **state_fields(key, self._covariance, gyro, gyro_sigma),
         )
         self._state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
-        if self._on_state is not None and not self._silent:
-            self._on_state(self._state)
+        if not self._silent:
+            call_back(self._on_state, self._state)
         return self._state
 
     def _report(self, innovation: Innovation) -> None:
-        if self._on_innovation is not None and not self._silent:
-            self._on_innovation(innovation)
+        if not self._silent:
+            call_back(self._on_innovation, innovation)

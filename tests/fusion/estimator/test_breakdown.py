@@ -47,3 +47,16 @@ def test_a_state_that_is_not_finite_is_not_given(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(estimator.chain, "covariance", lambda: np.full((estimator.chain.dim,) * 2, np.nan))
     with pytest.raises(DataError, match="starts anew"):
         add_all(estimator, rest)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, RuntimeError, KeyError])
+@pytest.mark.parametrize("callback", ["on_state", "on_innovation"])
+def test_an_error_of_a_callback_reaches_the_caller(callback: str, error: type[Exception]) -> None:
+    def fails(_: object) -> None:
+        raise error("of the caller")
+
+    estimator = Estimator(Estimator.for_vehicle("elevate").config, **{callback: fails})
+    with pytest.raises(error, match="of the caller"):
+        add_all(estimator, iter(drive()))
+    assert estimator.breakdowns == 0
+    assert estimator.latest() is not None
