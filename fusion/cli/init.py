@@ -111,13 +111,18 @@ def init(
     print_lines(result_lines(found, out))
     lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]
     again = _options(topics, stamps, columns, repair_clock)
-    command = f"terrafusion replay {shlex.quote(log)} --vehicle {shlex.quote(str(out))}{again} --out results"
-    if found.repaired:
-        fixed = f"{Path(log).stem}_fixed"
-        convert = f"terrafusion convert {shlex.quote(log)} {shlex.quote(fixed)} --apply-fixes"
-        lines.append(f"next: {convert} --vehicle {shlex.quote(str(out))}{again}")
-        command = f"terrafusion replay {shlex.quote(fixed)} --vehicle {shlex.quote(str(out))} --out results"
-    return Result(lines, f"{'then' if found.repaired else 'next'}: {command}", short=f"written to {out}")
+    first_step, command = _next_commands(log, out, again, found.repaired)
+    return Result([*lines, *first_step], command, short=f"written to {out}")
+
+
+def _next_commands(log: str, out: Path, again: str, repaired: bool) -> tuple[list[str], str]:
+    """What to type next: for a log with faults a line that repairs it, and the replay."""
+    vehicle = f"--vehicle {shlex.quote(str(out))}"
+    if not repaired:
+        return [], f"next: terrafusion replay {shlex.quote(log)} {vehicle}{again} --out results"
+    fixed = shlex.quote(f"{Path(log).stem}_fixed")
+    convert = f"next: terrafusion convert {shlex.quote(log)} {fixed} --apply-fixes {vehicle}{again}"
+    return [convert], f"then: terrafusion replay {fixed} {vehicle} --out results"
 
 
 def _parsed(text: str, name: str) -> Any:

@@ -165,20 +165,25 @@ def open_and_examine(path: Path, repair_clock: bool) -> None:
         repair(recording)
 
 
-def outcome_of(path: Path, repair_clock: bool) -> str:
-    """Open `path` in a child, limited in time and memory."""
+def outcome_in_child(work: Callable[[], int], seconds: float, outcomes: dict[int, str]) -> str:
+    """The outcome of `work`, which returns an exit status, in a child that has so many seconds."""
     child = os.fork()
     if child == 0:
-        os._exit(_in_child(path, repair_clock))
-    deadline = time.monotonic() + HANG_S
+        os._exit(work())
+    deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
-            return OUTCOMES.get(os.waitstatus_to_exitcode(status), "crash")
+            return outcomes.get(os.waitstatus_to_exitcode(status), "crash")
         time.sleep(0.002)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return "hang"
+
+
+def outcome_of(path: Path, repair_clock: bool) -> str:
+    """Open `path` in a child, limited in time and memory."""
+    return outcome_in_child(lambda: _in_child(path, repair_clock), HANG_S, OUTCOMES)
 
 
 def _in_child(path: Path, repair_clock: bool) -> int:

@@ -15,10 +15,8 @@ import io
 import os
 import resource
 import shutil
-import signal
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections import Counter
@@ -41,18 +39,7 @@ Task = Callable[[], bool]
 
 def outcome_of(task: Task, seconds: float = HANG_S) -> str:
     """A task in a child, limited in time and memory."""
-    child = os.fork()
-    if child == 0:
-        os._exit(_in_child(task))
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return OUTCOMES.get(os.waitstatus_to_exitcode(status), "crash")
-        time.sleep(0.002)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return "hang"
+    return readers.outcome_in_child(lambda: _in_child(task), seconds, OUTCOMES)
 
 
 def _in_child(task: Task) -> int:
