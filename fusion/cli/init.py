@@ -111,7 +111,7 @@ def init(
     print_lines(result_lines(found, out))
     lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]
     again = _options(topics, stamps, columns, repair_clock)
-    first_step, command = _next_commands(log, out, again, found.repaired)
+    first_step, command = _next_commands(log, out, again, bool(found.repaired))
     return Result([*lines, *first_step], command, short=f"written to {out}")
 
 

@@ -1,4 +1,4 @@
-"""Wrong usage of the command line, told in one line with the nearest match."""
+"""Wrong usage of the command line, as one line with the nearest match."""
 
 from __future__ import annotations
 
