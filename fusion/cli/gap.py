@@ -108,7 +108,7 @@ def gap(
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
     """
     from terrafusion.fusion.reports.gap import write_diagnosis
-    from terrafusion.fusion.reports.gap_text import answer, details
+    from terrafusion.fusion.reports.gap_text import answer, details, verdict_line
     from terrafusion.twin.gap.answer.corrected import write_corrected
     from terrafusion.twin.gap.diagnose import diagnose
     from terrafusion.twin.model.vehicle import load_vehicle
@@ -127,10 +127,10 @@ def gap(
     write_diagnosis(out, found, {"command": command_line()}, scores)
     changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
     written = write_vehicle if changes and found.verdict.named else None
-    told = answer(found, out, written)
+    lines = answer(found, out, written)
     document = read_json(out / "diagnosis.json")
-    more, short = [*changes, *details(found)], f"{told[0]}; written to {out}"
-    return Result([*compared, *told], "", document, details=more, short=short)
+    more, short = [*changes, *details(found)], f"{verdict_line(found)} Written to {out}"
+    return Result([*compared, *lines], "", document, details=more, short=short)
 
 
 def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 MOST_CAUSES = 8
 PLACE_S = 0.5
 """Interval of a path that is drawn as one point."""
+LEAST_SIDE = 0.5
+"""Shorter side of the frame of a path over its longer one."""
 ALIKE = "#9ecae1"
 
 
@@ -80,10 +82,20 @@ def plot_path(d: GapDiagnosis, most: int) -> Figure:
             known = np.interp(t_s, run.time_s[np.argsort(run.time_s)], _in_regime(d, run, index)) > 0.5
             ax.plot(at[known, 0], at[known, 1], "o", color=style.TRUTH, markersize=7, fillstyle="none")
         points = ax.scatter(at[:, 0], at[:, 1], c=error, s=14, cmap="YlOrRd", vmin=0.0, vmax=top, zorder=3)
-        ax.set_aspect("equal", adjustable="box")
+        x, y = _limits(at)
+        ax.set(xlim=x, ylim=y, aspect="equal")
         style.format_axes(ax, x="x, m", y="y, m", title=Path(run.name).name)
     fig.colorbar(points, ax=axes, label=f"{name}: RMS error of {PLACE_S:g} s, {CHANNEL_UNITS[name]}")
     return fig
+
+
+def _limits(at: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of both axes of a path (N, 2), m; a straight one is not drawn on a line."""
+    low, high = at.min(axis=0), at.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.55 * (high - low)
+    half = np.maximum(half, max(LEAST_SIDE * float(half.max()), 0.5))
+    (x0, y0), (x1, y1) = (middle - half).tolist(), (middle + half).tolist()
+    return (x0, x1), (y0, y1)
 
 
 def _in_regime(d: GapDiagnosis, run: WhitenedRun, index: int) -> Array:
