@@ -51,6 +51,8 @@ def benchmark(
     seeds: int | None = None,
     only: Sequence[str] = (),
     jobs: int = 1,
+    backend: str = "loky",
+    address: str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> pd.DataFrame:
     """Compare adaptive weights with fixed ones and other baselines; one row a drive and method.
@@ -62,7 +64,8 @@ def benchmark(
         quick: few drives.
         seeds: drives of each family on each plant.
         only: families, such as "mixed" or "mixed=3".
-        jobs: processes.
+        jobs: processes on this machine.
+        backend: "loky" (this machine) or "dask", then with the `address` of its scheduler.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -79,6 +82,6 @@ def benchmark(
 
     plan = BenchmarkPlan(families_of(list(only)), seeds, quick)
     origin = origin_of(plan, "terrafusion.benchmark")
-    result = run_benchmark(plan, Path(out), jobs=jobs, progress=progress)
+    result = run_benchmark(plan, Path(out), jobs=jobs, backend=backend, address=address, progress=progress)
     write_benchmark(Path(out), result, at_the_end(origin))
     return pd.json_normalize([dataclasses.asdict(row) for row in result.rows])

@@ -33,13 +33,20 @@ class BenchmarkResult:
 
 
 def run_benchmark(
-    plan: BenchmarkPlan, out: Path, *, jobs: int = 1, progress: Callable[[float], None] | None = None
+    plan: BenchmarkPlan,
+    out: Path,
+    *,
+    jobs: int = 1,
+    backend: str = "loky",
+    address: str | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> BenchmarkResult:
     """Run the jobs without a checkpoint in `out`; returns the results of all jobs in the order of the plan.
 
     Args:
         out: folder; checkpoints of other sources or files, and of refused logs, are computed again.
-        jobs: processes.
+        jobs: processes on this machine.
+        backend: "loky" (this machine) or "dask", then with the `address` of its scheduler.
         progress: called with the share of the jobs that is done, 0 to 1.
 
     Raises:
@@ -55,12 +62,13 @@ def run_benchmark(
     check_folder(out / FOLDER)
     results = {job: stored for job in planned if (stored := _stored(out, job)) is not None}
     missing = [job for job in planned if job not in results]
-    with open_workers("loky", min(jobs, max(len(missing), 1))) as workers:
-        for job, new in workers.results(run_job, [(job,) for job in missing]):
-            part = write_part(out, job.key, dataclasses.asdict(new), _state(job))
-            results[job] = BenchmarkResult.read(part)
-            if progress is not None:
-                progress(len(results) / len(planned))
+    if missing:
+        with open_workers(backend, min(jobs, len(missing)), address) as workers:
+            for job, new in workers.results(run_job, [(job,) for job in missing]):
+                part = write_part(out, job.key, dataclasses.asdict(new), _state(job))
+                results[job] = BenchmarkResult.read(part)
+                if progress is not None:
+                    progress(len(results) / len(planned))
     rows = tuple(row for job in planned for row in results[job].rows)
     refused = dict.fromkeys(one for job in planned for one in results[job].refused)
     return BenchmarkResult(rows, tuple(refused))

@@ -10,6 +10,13 @@ import typer
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import progress_bar, read_json
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.workers import (
+    AddressOption,
+    BackendOption,
+    JobsOption,
+    check_backend,
+    processes,
+)
 
 OUTPUT = Output(
     "Folder for the results; an interrupted benchmark continues.",
@@ -22,9 +29,9 @@ OUTPUT = Output(
 def benchmark(
     out: Path,
     quick: Annotated[bool, typer.Option("--quick", help="Few runs: two minutes on two processors.")] = False,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes; by default one a processor.", show_default=False)
-    ] = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "loky",
+    address: AddressOption = None,
     seeds: Annotated[
         int | None,
         typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False),
@@ -47,8 +54,6 @@ def benchmark(
 
     Example: terrafusion benchmark --out results --quick
     """
-    import joblib
-
     from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import (
@@ -59,6 +64,7 @@ def benchmark(
         write_document,
     )
 
+    check_backend(backend, address)
     plan = BenchmarkPlan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
     words += [f"--seeds {seeds}"] if seeds else []
@@ -68,7 +74,9 @@ def benchmark(
     if docs is not None:
         document_head(docs)  # refuse now, not after hours
     with progress_bar("benchmark") as progress:
-        result = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
+        result = run_benchmark(
+            plan, out, jobs=processes(jobs), backend=backend, address=address, progress=progress
+        )
     origin = at_the_end(origin)
     made = write_benchmark(out, result, origin)
     if docs is not None:

@@ -19,7 +19,7 @@ import typer
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli.common import PROGRESS
-from terrafusion.fusion.cli.outputs import Output, check_file
+from terrafusion.fusion.cli.outputs import Output, check_file, parts_of
 
 PANEL = "Options of all commands"
 INTERRUPTED = 130
@@ -174,7 +174,10 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 def interrupted(out: Path | None, output: Output | None) -> str:
     """What is kept of an interrupted command, and where."""
-    if output is None or out is None or not out.exists():
+    places = (
+        [] if output is None or out is None else [place for place in (out, parts_of(out)) if place.exists()]
+    )
+    if output is None or not places:
         return "interrupted; nothing was written"
     more = "; the same command with this --out continues" if output.goes_on else ""
-    return f"interrupted; what was finished is kept in {out}{more}"
+    return f"interrupted; what was finished is kept in {places[-1]}{more}"

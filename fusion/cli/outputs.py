@@ -82,6 +82,11 @@ def default_name(command: str, subject: str, suffix: str = "") -> Path:
         begun += 1.0
 
 
+def parts_of(out: Path) -> Path:
+    """Folder for the finished parts of a single file that takes long to make."""
+    return out.with_name(f"{out.name}.parts")
+
+
 def check_file(path: Path, force: bool = False, mark: str | None = None) -> None:
     """Refuse a file that cannot be written, or that is there and was not written by this library.
 

@@ -11,6 +11,13 @@ import typer
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.workers import (
+    AddressOption,
+    BackendOption,
+    JobsOption,
+    check_backend,
+    processes,
+)
 
 if TYPE_CHECKING:
     from terrafusion.twin.sweep.plan import Sweep
@@ -32,13 +39,9 @@ RecordingsOption = Annotated[
 def sweep(
     sweep: Annotated[str, typer.Argument(help="Name of a built-in sweep, or a YAML file.")],
     out: Path,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes on this machine; by default one a processor.")
-    ] = None,
-    backend: Annotated[str, typer.Option(help="loky: this machine; dask: a cluster.")] = "loky",
-    address: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="The Dask cluster's scheduler.")
-    ] = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "loky",
+    address: AddressOption = None,
     max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html and plots.")] = True,
     recordings: RecordingsOption = None,
@@ -56,10 +59,7 @@ def sweep(
     from terrafusion.twin.sweep.recordings import check_runs, write_recordings
     from terrafusion.twin.sweep.run import run_sweep
 
-    if backend not in ("loky", "dask"):
-        raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
-    if (address is not None) != (backend == "dask"):
-        raise typer.BadParameter("goes with --backend dask, which needs it", param_hint="--address")
+    check_backend(backend, address)
     if recordings_format not in ("folder", "mcap"):
         raise typer.BadParameter(
             f"'{recordings_format}' is neither 'folder' nor 'mcap'", param_hint="--recordings-format"
@@ -67,7 +67,7 @@ def sweep(
     plan = load_sweep(sweep)
     chosen = _numbers(recordings or [], plan)
     check_runs(plan, chosen)
-    count = jobs if jobs is not None else _processors()
+    count = processes(jobs)
     print(f"{plan.name}: {plan.design()}", flush=True)
     with progress_bar(f"sweep {plan.name}") as progress:
         table = run_sweep(
@@ -111,9 +111,3 @@ def _numbers(entries: list[str], plan: Sweep) -> list[int]:
         if not entry.isdecimal():
             raise typer.BadParameter(f"'{entry}' is neither a number nor 'all'", param_hint="--recordings")
     return sorted({int(entry) for entry in entries})
-
-
-def _processors() -> int:
-    import joblib
-
-    return int(joblib.cpu_count())

@@ -14,8 +14,15 @@ import typer
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli.command import Result, add_command
 from terrafusion.fusion.cli.common import progress_bar
-from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.outputs import Output, parts_of
 from terrafusion.fusion.cli.usage import CommandGroup
+from terrafusion.fusion.cli.workers import (
+    AddressOption,
+    BackendOption,
+    JobsOption,
+    check_backend,
+    processes,
+)
 
 if TYPE_CHECKING:
     from terrafusion.fusion.training.detector_scores import DetectorScores
@@ -32,15 +39,20 @@ def train(
         int | None,
         typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False),
     ] = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "loky",
+    address: AddressOption = None,
 ) -> Result:
     """Train the terrain model on simulated runs, or a classifier of one robot's grounds on its labelled logs.
 
     Without logs the twin drives over soils, slopes, payloads and speeds; one
-    more seed calibrates the probabilities and one scores the model.
+    more seed calibrates the probabilities and one scores the model. Stopped,
+    the same command continues.
 
     Example: terrafusion terrain train --out model.yaml
     Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
+    check_backend(backend, address)
     if logs:
         no_seeds(seeds)
         return train_on_logs(logs, out)
@@ -49,7 +61,9 @@ def train(
 
     plan = TrainingPlan() if seeds is None else TrainingPlan(seeds=seeds)
     with progress("runs", plan.runs()) as tick:
-        model, scores = run(plan, tick)
+        model, scores = run(
+            plan, tick, jobs=processes(jobs), backend=backend, address=address, parts=parts_of(out)
+        )
     write_model(model, out)
     done = f"temperature {model.temperature:g}; inputs {model.inputs_sha256[:16]}; written to {out}"
     return Result(score_lines("held-out seed", scores), done, {"out": str(out), **dataclasses.asdict(scores)})
@@ -188,6 +202,8 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
         yield (lambda: report(next(steps) / total)) if report is not None else lambda: None
 
 
-MODEL = Output("Model file (YAML) to write.", suffix=".yaml", mark="made_by: terrafusion terrain train")
+MODEL = Output(
+    "Model file (YAML) to write.", suffix=".yaml", mark="made_by: terrafusion terrain train", goes_on=True
+)
 add_command(app, "train", train, output=MODEL)
 add_command(app, "eval", evaluate, files={"out": None})

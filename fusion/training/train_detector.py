@@ -7,7 +7,7 @@ and for the scores.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,10 @@ from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, W
 from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.mixture import fit_best
-from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all, windows_of
+from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, Grid, windows_of
+from terrafusion.fusion.training.window_store import WindowStore
+from terrafusion.twin.executors import Workers, open_workers
+from terrafusion.twin.model.version import model_sha256, version
 
 Array = NDArray[np.float64]
 LabelledWindows = tuple[list[Window], str]
@@ -63,14 +66,36 @@ class TrainingPlan:
         return (self.seeds + 2) * len(self.grid(0).conditions())
 
 
-def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainModel, DetectorScores]:
+def train(
+    plan: TrainingPlan,
+    tick: Callable[[], None] = lambda: None,
+    *,
+    jobs: int = 1,
+    backend: str = "loky",
+    address: str | None = None,
+    parts: Path | None = None,
+) -> tuple[TerrainModel, DetectorScores]:
     """Simulate, fit, calibrate and score; `tick` is called after each run.
 
+    Args:
+        jobs: processes on this machine.
+        backend: "loky" (this machine) or "dask", then with the `address` of its scheduler.
+        parts: folder for finished runs, from which an interrupted training continues; removed at the end.
+
     Raises:
-        TerrafusionError: too few windows on a ground.
+        TerrafusionError: too few windows on a ground, workers died, or the folder cannot be written.
     """
+    store = (
+        None if parts is None else WindowStore(parts, f"{version()} {model_sha256()} {fingerprint_of(plan)}")
+    )
+    sets = (plan.training(), plan.grid(CALIBRATION_SEED), plan.grid(SCORING_SEED))
+    conditions = [condition for grid in sets for condition in grid.conditions()]
+    with open_workers(backend, min(jobs, len(conditions)), address) as workers:
+        runs = run_windows(conditions, workers, store, tick)
+    ends = np.cumsum([len(grid.conditions()) for grid in sets])
+    training, calibration, scoring = runs[: ends[0]], runs[ends[0] : ends[1]], runs[ends[1] :]
     rows: dict[str, list[Array]] = {ground: [] for ground in GROUNDS}
-    for windows, ground in windows_by_run(plan.training(), tick):
+    for windows, ground in training:
         rows[ground].append(features_of(windows))
     mixtures = {}
     for ground, parts in rows.items():
@@ -91,29 +116,37 @@ def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[
         inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
     )
-    held_out = list(windows_by_run(plan.grid(CALIBRATION_SEED), tick))
-    model = calibrate(draft, splice(held_out, PATCHES, CALIBRATION_SEED))
-    scores = evaluate(model, routes_of(plan, SCORING_SEED, tick))
+    model = calibrate(draft, splice(calibration, PATCHES, CALIBRATION_SEED))
+    scores = evaluate(model, [splice(scoring, PATCHES, SCORING_SEED)])
+    if store is not None:
+        store.clear()
     return dataclasses.replace(model, scores=_plain(scores)), scores
-
-
-def routes_of(
-    plan: TrainingPlan, first_seed: int, tick: Callable[[], None], seeds: int = 1
-) -> list[LabelledRoute]:
-    """Spliced routes of `seeds` seeds from `first_seed`, one a seed."""
-    return [
-        splice(list(windows_by_run(plan.grid(seed), tick)), PATCHES, seed)
-        for seed in range(first_seed, first_seed + seeds)
-    ]
 
 
 def windows_by_run(grid: Grid, tick: Callable[[], None]) -> list[LabelledWindows]:
     """The windows and ground of every run of a grid."""
-    runs: list[LabelledWindows] = []
-    for condition, recording in run_all(grid.conditions(), tick):
-        windows, _ = windows_of(recording, condition.stream("estimator"))
-        runs.append((windows, condition.terrain))
-    return runs
+    return run_windows(grid.conditions(), Workers(None), None, tick)
+
+
+def run_windows(
+    conditions: Sequence[Condition], workers: Workers, store: WindowStore | None, tick: Callable[[], None]
+) -> list[LabelledWindows]:
+    """The windows and ground of every run, in order; `store` keeps those of finished ones."""
+    windows = [None if store is None else store.read(number) for number in range(len(conditions))]
+    missing = [number for number, stored in enumerate(windows) if stored is None]
+    for _ in range(len(conditions) - len(missing)):
+        tick()
+    for number, made in workers.results(_numbered, ((number, conditions[number]) for number in missing)):
+        windows[number] = made
+        if store is not None:
+            store.write(number, made)
+        tick()
+    return [(made or [], one.terrain) for made, one in zip(windows, conditions, strict=True)]
+
+
+def _numbered(number: int, condition: Condition) -> tuple[int, list[Window]]:
+    """Simulates one run, on a worker."""
+    return number, windows_of(condition.run(), condition.stream("estimator"))[0]
 
 
 def features_of(windows: list[Window]) -> Array:

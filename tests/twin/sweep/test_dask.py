@@ -5,11 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +19,7 @@ from terrafusion.twin import executors
 from terrafusion.twin.sweep.load import load_sweep
 from terrafusion.twin.sweep.plan import Sweep
 from terrafusion.twin.sweep.run import run_sweep
+from tests.dask_cluster import PATIENCE_S, scheduler, started, wait_for_workers, worker
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 
@@ -32,54 +30,12 @@ axes:
   friction: {from: 0.2, to: 0.8, count: 8}
   slope_deg: [0, 3, 6, 9]
 """
-PATIENCE_S = 60.0
 
 
 def sweep_of(folder: Path, duration_s: int = 2) -> Sweep:
     (folder / "drive.yaml").write_text(f"drive: [{{duration_s: {duration_s}, v_mps: 1.0}}]\n")
     (folder / "own.yaml").write_text(SWEEP)
     return load_sweep(folder / "own.yaml")
-
-
-@contextlib.contextmanager
-def started(*words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A `dask` process, in its own process group, ended at the end."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "dask", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    try:
-        yield child
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
-
-
-@contextlib.contextmanager
-def scheduler(folder: Path) -> Iterator[str]:
-    """A scheduler without workers; its address."""
-    file = folder / "scheduler.json"
-    options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
-    with started("scheduler", *options):
-        limit = time.monotonic() + PATIENCE_S
-        while not file.is_file() or not file.read_text().strip():
-            assert time.monotonic() < limit, "the scheduler did not start"
-            time.sleep(0.05)
-        yield json.loads(file.read_text())["address"]
-
-
-def worker(address: str, *more: str) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:
-    return started("worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny", *more)
-
-
-def wait_for_workers(address: str, count: int) -> None:
-    from distributed import Client
-
-    with Client(address, set_as_default=False) as client:
-        client.wait_for_workers(count, timeout=PATIENCE_S)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,83 @@
+"""Windows of finished simulated runs in a folder, so that an interrupted training continues."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from terrafusion.datasets.core.files import check_folder, write_atomically
+from terrafusion.fusion.terrain.features import Window
+
+
+@dataclass(frozen=True)
+class WindowStore:
+    """One file a run.
+
+    Attributes:
+        folder: of the files.
+        state: hash of what the runs depend on; files of another state are not read.
+    """
+
+    folder: Path
+    state: str
+
+    def read(self, number: int) -> list[Window] | None:
+        """Windows of run `number`; None if they are missing, incomplete or of another state."""
+        try:
+            with np.load(self._file(number), allow_pickle=False) as data:
+                if str(data["state"]) != self.state:
+                    return None
+                numbers, imu, counts = data["numbers"], data["imu"], data["counts"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        parts = np.split(imu, np.cumsum(counts)[:-1])
+        return [_window(row, samples) for row, samples in zip(numbers, parts, strict=True)]
+
+    def write(self, number: int, windows: list[Window]) -> None:
+        """Store the windows of run `number`.
+
+        Raises:
+            TerrafusionError: the folder cannot be written.
+        """
+        check_folder(self.folder)
+        numbers = [[np.nan if value is None else value for value in _numbers(w)] for w in windows]
+        imu = [np.column_stack([w.imu_t_s, w.gyro_radps, w.accel_mps2]) for w in windows]
+        counts = np.array([len(samples) for samples in imu])
+        content = {"state": np.array(self.state), "numbers": np.array(numbers), "counts": counts}
+
+        def save(part: Path) -> None:
+            with part.open("wb") as file:  # np.savez would add a suffix to a name
+                np.savez(file, imu=np.vstack(imu), **content)
+
+        write_atomically(self._file(number), save)
+
+    def clear(self) -> None:
+        """Remove all files: the model they were for is written."""
+        if self.folder.is_dir():
+            for file in self.folder.glob("run-*.npz*"):
+                file.unlink()
+            if not any(self.folder.iterdir()):
+                self.folder.rmdir()
+
+    def _file(self, number: int) -> Path:
+        return self.folder / f"run-{number:05d}.npz"
+
+
+def _numbers(w: Window) -> list[float | None]:
+    return [
+        w.dt_s, w.wheel_speed_mps, w.wheel_speed_rate_mps2, w.speed_mps, w.yaw_rate_wheels_radps,
+        w.yaw_rate_gyro_radps, w.slip, w.slip_sigma,
+    ]  # fmt: skip
+
+
+def _window(row: np.ndarray, imu: np.ndarray) -> Window:
+    dt, wheel, rate, speed, yaw_wheels, yaw_gyro, slip, sigma = row.tolist()
+    known = not np.isnan(slip)
+    return Window(
+        dt_s=dt, imu_t_s=imu[:, 0], gyro_radps=imu[:, 1:4], accel_mps2=imu[:, 4:7], wheel_speed_mps=wheel,
+        wheel_speed_rate_mps2=rate, speed_mps=speed, yaw_rate_wheels_radps=yaw_wheels,
+        yaw_rate_gyro_radps=yaw_gyro, slip=slip if known else None, slip_sigma=sigma if known else None,
+    )  # fmt: skip
