@@ -22,7 +22,7 @@ from tests.dask_cluster import scheduler, wait_for_workers, worker
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 
-TRAINING = TrainingPlan(1, ("figure_eight",), (0.0,), (0.0,))
+TRAINING = TrainingPlan(1, ("figure_eight",), (0.0, 3.0), (0.0,))
 
 
 @pytest.fixture(scope="module")
