@@ -78,6 +78,23 @@ STUDIES = (
         },
     ),
     Study(
+        "soak",
+        "Do memory, computing time and snapshots stay bounded over hours of live data?",
+        _module("soak", "--hours", "3"),
+        12,
+        {
+            f"{key}_{what}": rf"{name}: .*{pattern}"
+            for key, name in (("self", "self-calibration"), ("states", "calibration states"))
+            for what, pattern in (
+                ("hours", r"hours ([\d.]+)"),
+                ("mb", r"grown (-?[\d.]+) MB"),
+                ("p99", r"ratio ([\d.]+)"),
+                ("snapshot_kb", r"largest (\d+) kB"),
+                ("targets", "targets (met|missed)"),
+            )
+        },
+    ),
+    Study(
         "demo_seeds",
         "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",
         _module("demo_seeds", "--seeds", "10"),

@@ -26,7 +26,7 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.outputs.robot_file import write_robot
 from terrafusion.fusion.replay import replay
 from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
@@ -195,3 +195,14 @@ def test_a_complete_file_is_extended_and_never_overwritten(found: SensorCalibrat
     own = load_vehicle(write_robot(tmp_path / "own.yaml", started))
     assert own.name == "mine"
     assert own.robot == found.known()
+
+
+def test_a_robot_that_steers_its_front_wheels_has_its_antenna_where_its_file_says() -> None:
+    """Its path is that of the rear axle, half a wheelbase behind the origin."""
+    legs = (DriveSegment(2.0), *3 * (DriveSegment(7.0, 0.9, 0.35), DriveSegment(6.0, 1.2, -0.3)))
+    scenario = Scenario("bends", 41.0, route=(RouteLeg("asphalt"),), drive=legs)
+    vehicle = with_overrides(load_vehicle("elevate"), Overrides(drive="ackermann"))
+    result = replay(simulate(scenario, vehicle=vehicle, seed=3), vehicle=vehicle, mode="fixed")
+    antenna = next(number for number in result.learned if number.state == "antenna_x_m")
+    assert antenna.sigma < 0.04
+    assert abs(antenna.value) < 2.5 * antenna.sigma
