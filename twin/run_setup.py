@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
@@ -27,8 +27,6 @@ from terrafusion.twin.scenario.scenario import Scenario
 from terrafusion.twin.scenario.validity import check_ground, check_slip
 from terrafusion.twin.sensors.effects import as_driven, true_motion, with_effects
 from terrafusion.twin.sensors.gnss import best_fix
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

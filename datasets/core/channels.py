@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -54,6 +55,10 @@ class Channel:
     """What all channels share: a clock and rows."""
 
     name: ClassVar[str] = ""
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {}
+    """Columns of the log folder by field, (N,) or (N, k)."""
+    SAMPLE: ClassVar[type[Message]]
+    """Type of the channel's messages, whose fields are those of the channel."""
     t_ns: TimesNs
 
     def __post_init__(self) -> None:
@@ -93,11 +98,18 @@ class Channel:
 
     def samples(self) -> Iterator[Message]:
         """One message a row, in order of time."""
-        raise TypeError(f"{type(self).__name__} has no messages")
+        fields = (getattr(self, spec.name) for spec in dataclasses.fields(self))
+        make: Any = self.SAMPLE
+        return map(make, *map(_cells, fields))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Columns of the log folder without `t_s`; absent ones left out."""
-        raise TypeError(f"{type(self).__name__} has no table form")
+        table: dict[str, NDArray[Any]] = {}
+        for field, names in self.COLUMNS.items():
+            values = getattr(self, field)
+            if values is not None:
+                table |= zip(names, [values] if values.ndim == 1 else values.T, strict=True)
+        return table
 
     def to_pandas(self) -> pd.DataFrame:
         """The columns of the log folder, indexed by `t_ns`."""
@@ -106,8 +118,11 @@ class Channel:
         return pd.DataFrame(self.columns(), index=pd.Index(self.t_ns, name="t_ns"))
 
 
-def _named(values: Array, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    return {name: values[:, i] for i, name in enumerate(names) if not np.isnan(values[:, i]).all()}
+def _cells(values: Any) -> Iterable[Any]:
+    """A field row by row; what is no array is the same in all rows."""
+    if not isinstance(values, np.ndarray):
+        return itertools.repeat(values)
+    return values.tolist() if values.ndim == 1 else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +130,13 @@ class Command(Channel):
     """Commanded body twist: `v_mps` (N,), `yaw_rate_radps` (N,)."""
 
     name: ClassVar[str] = "command"
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "v_mps": ("v_mps",),
+        "yaw_rate_radps": ("yaw_rate_radps",),
+    }
+    SAMPLE = CommandSample
     v_mps: Array
     yaw_rate_radps: Array
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        return {"v_mps": self.v_mps, "yaw_rate_radps": self.yaw_rate_radps}
-
-    def samples(self) -> Iterator[CommandSample]:
-        """One message a row."""
-        return map(CommandSample, self.t_ns.tolist(), self.v_mps.tolist(), self.yaw_rate_radps.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +149,7 @@ class Wheels(Channel):
     """
 
     name: ClassVar[str] = "wheels"
+    SAMPLE = WheelSample
     LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("left", "right"),
         ("front_left", "front_right", "rear_left", "rear_right"),
@@ -171,12 +185,6 @@ class Wheels(Channel):
         """Circumferential speed (N, 2) of left and right, m/s; both equal where sides are unknown."""
         return sides(self.speed * (wheel_radius_m if self.unit == "radps" else 1.0), self.names)
 
-    def samples(self) -> Iterator[WheelSample]:
-        """One message a row."""
-        angle = [None] * len(self) if self.angle_rad is None else list(self.angle_rad)
-        for t_ns, row, turned in zip(self.t_ns.tolist(), self.speed, angle, strict=True):
-            yield WheelSample(t_ns, row, self.names, self.unit, turned)
-
 
 @dataclass(frozen=True, eq=False)
 class Imu(Channel):
@@ -187,22 +195,22 @@ class Imu(Channel):
     """
 
     name: ClassVar[str] = "imu"
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "gyro_radps": ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"),
+        "accel_mps2": ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"),
+    }
+    SAMPLE = ImuSample
     gyro_radps: Array
     accel_mps2: Array
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        gyro = _named(self.gyro_radps, ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"))
-        return gyro | _named(self.accel_mps2, ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"))
+        return {name: axis for name, axis in super().columns().items() if not np.isnan(axis).all()}
 
     def has_gyro(self) -> bool:
         return not np.isnan(self.gyro_radps).all(axis=0).any()
 
     def has_accel(self) -> bool:
         return not np.isnan(self.accel_mps2).all(axis=0).any()
-
-    def samples(self) -> Iterator[ImuSample]:
-        """One message a row."""
-        return map(ImuSample, self.t_ns.tolist(), self.gyro_radps, self.accel_mps2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +222,7 @@ class Gnss(Channel):
     """
 
     name: ClassVar[str] = "gnss"
+    SAMPLE = GnssSample
     enu_m: Array
     sigma_enu_m: Array
     fix: NDArray[np.uint8]
@@ -236,15 +245,11 @@ class Gnss(Channel):
         table["fix"] = np.array([Fix(f).name.lower() for f in self.fix], dtype=object)
         return table
 
-    def samples(self) -> Iterator[GnssSample]:
+    def samples(self) -> Iterator[Message]:
         """One message a row."""
-        n = len(self)
-        velocity = [None] * n if self.velocity_enu_mps is None else list(self.velocity_enu_mps)
-        sigma_v = np.full(n, np.nan) if self.sigma_v_mps is None else self.sigma_v_mps
-        return map(
-            GnssSample,
-            self.t_ns.tolist(), self.enu_m, self.sigma_enu_m, self.fix.tolist(), velocity, sigma_v.tolist(),
-        )  # fmt: skip
+        if self.sigma_v_mps is not None:
+            return super().samples()
+        return dataclasses.replace(self, sigma_v_mps=np.full(len(self), np.nan)).samples()
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,19 +257,13 @@ class Motor(Channel):
     """Motor currents `current_a` (N, 2) left and right, and voltages `voltage_v` (N, 2) where known."""
 
     name: ClassVar[str] = "motor"
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "current_a": ("left_a", "right_a"),
+        "voltage_v": ("left_v", "right_v"),
+    }
+    SAMPLE = MotorSample
     current_a: Array
     voltage_v: Array | None = None
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        table: dict[str, NDArray[Any]] = {"left_a": self.current_a[:, 0], "right_a": self.current_a[:, 1]}
-        if self.voltage_v is not None:
-            table |= {"left_v": self.voltage_v[:, 0], "right_v": self.voltage_v[:, 1]}
-        return table
-
-    def samples(self) -> Iterator[MotorSample]:
-        """One message a row."""
-        voltage = [None] * len(self) if self.voltage_v is None else list(self.voltage_v)
-        return map(MotorSample, self.t_ns.tolist(), self.current_a, voltage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +276,7 @@ class Steering(Channel):
     """
 
     name: ClassVar[str] = "steering"
+    SAMPLE = SteeringSample
     LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("angle",),
         ("front", "rear"),
@@ -302,11 +302,6 @@ class Steering(Channel):
         """Mean angle (N, 2) of front and rear wheels, rad; `steering_ratio` is used for a steering wheel."""
         return axles(self.angle_rad, self.names, steering_ratio)
 
-    def samples(self) -> Iterator[SteeringSample]:
-        """One message a row."""
-        for t_ns, row in zip(self.t_ns.tolist(), self.angle_rad, strict=True):
-            yield SteeringSample(t_ns, row, self.names)
-
 
 @dataclass(frozen=True, eq=False)
 class Barometer(Channel):
@@ -316,14 +311,9 @@ class Barometer(Channel):
     """
 
     name: ClassVar[str] = "barometer"
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {"pressure_pa": ("pressure_pa",)}
+    SAMPLE = BarometerSample
     pressure_pa: Array
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        return {"pressure_pa": self.pressure_pa}
-
-    def samples(self) -> Iterator[BarometerSample]:
-        """One message a row."""
-        return map(BarometerSample, self.t_ns.tolist(), self.pressure_pa.tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,19 +321,14 @@ class Magnetometer(Channel):
     """Magnetic flux density `field_t` (N, 3), body axes, tesla; at the robot."""
 
     name: ClassVar[str] = "magnetometer"
+    COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {"field_t": ("field_x_t", "field_y_t", "field_z_t")}
+    SAMPLE = MagnetometerSample
     field_t: Array
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.field_t.shape != (len(self), 3):
             raise ValueError(f"magnetometer: field_t has shape {self.field_t.shape}, not ({len(self)}, 3)")
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        return {f"field_{axis}_t": self.field_t[:, i] for i, axis in enumerate("xyz")}
-
-    def samples(self) -> Iterator[MagnetometerSample]:
-        """One message a row."""
-        return map(MagnetometerSample, self.t_ns.tolist(), self.field_t)
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +357,7 @@ class Terrain(Channel):
             table |= {f"p_{name}": self.probabilities[:, i] for i, name in enumerate(self.classes)}
         return table
 
-    def samples(self) -> Iterator[TerrainSample]:
+    def samples(self) -> Iterator[Message]:
         """One message a row."""
         rows = [None] * len(self) if self.probabilities is None else self.probabilities.tolist()
         for t_ns, label, row in zip(self.t_ns.tolist(), self.label, rows, strict=True):

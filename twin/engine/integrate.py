@@ -9,16 +9,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.engine.native import Driver, driver
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import INPUTS, STATES, VEHICLE_PARAMETERS
-
-Array = NDArray[np.float64]
 
 BACKENDS = ("auto", "c", "vm")
 MAX_STEP_S = 1.0 / 300.0

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.integrate import chosen, steps_a_sample
 from terrafusion.twin.engine.native import CPlant, Driver
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import INPUTS, STATES
-
-Array = NDArray[np.float64]
 
 
 def integrate_many(

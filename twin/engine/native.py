@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import codegen, compiler
 from terrafusion.twin.engine.codegen import Variant
 from terrafusion.twin.model.plant import Plant
 
-Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")
 
 MAX_BLOCKS = 4

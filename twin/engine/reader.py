@@ -8,13 +8,12 @@ import logging
 import subprocess
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import codegen, compiler
 from terrafusion.twin.engine.native import BUILDING
 from terrafusion.twin.physics.layout import OUTPUTS
 
-Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")
 
 

@@ -11,16 +11,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import TANGENT, Variant
 from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
 from terrafusion.twin.engine.native import MAX_BLOCKS, Driver
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ import functools
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.plant import Plant, SoilField, smoothstep
 from terrafusion.twin.physics.layout import (
@@ -19,8 +19,6 @@ from terrafusion.twin.physics.layout import (
     STATES,
     VEHICLE_PARAMETERS,
 )
-
-Array = NDArray[np.float64]
 
 _CHUNK = 50
 _ARGUMENTS = ("x", "t", "ua", "ub", "constants", "effects", "at", "table")

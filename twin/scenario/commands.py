@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.effects.steered import wheel_path
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import ENDS, ENERGIES, INDEX, INPUTS, SIDES, STATES, state_slice
 from terrafusion.twin.scenario.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 SETTLE_S = 10.0
 """The robot stands this long before the run starts: it starts in equilibrium."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.ground import SoilPatches, Variation, soil_field
 from terrafusion.twin.model.plant import RouteTable, smoothstep
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.scenario.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,12 +23,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.twin.model.ground import SoilPatches, Variation
-
-Array = NDArray[np.float64]
 
 MAX_SLOPE_DEG = 25.0
 Start = Annotated[float, Quantity("s", 0.0, 36000.0)]

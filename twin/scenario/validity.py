@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.ground import patch_share
@@ -21,8 +21,6 @@ from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, state_slice
 from terrafusion.twin.scenario.route import Route
 from terrafusion.twin.scenario.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 MOVING_MPS = 0.1
 TURNING_RADPS = 0.5

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Motor
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import state_slice
 from terrafusion.twin.physics.motors import motor_current, motor_voltage
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz, stepped
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 
 def motor_channel(

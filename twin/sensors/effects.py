@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import moves
@@ -27,7 +28,6 @@ from terrafusion.twin.physics.layout import OUTPUTS, VEHICLE_PARAMETERS
 from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
 
-Array = NDArray[np.float64]
 C = TypeVar("C", Imu, Gnss)
 
 DEAD_TIME = "dead_time/transport"

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import WHEELS, state_slice
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 
 def wheels_channel(

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.atmosphere import pressure_at
 from terrafusion.datasets.core.channels import Barometer, Magnetometer
 from terrafusion.twin.model.motion import BodyMotion
@@ -25,9 +25,6 @@ from terrafusion.twin.sensors.noise import (
     rows_at_rate,
     sample_rate_hz,
 )
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 FIELD_SIZE_T, INCLINATION_RAD, DECLINATION_RAD = 49.54e-6, math.radians(67.35), math.radians(3.35)
 """World Magnetic Model 2020 at 52 deg N, 8 deg E, 100 m, for 2024-01-01. The declination is positive to the

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.sensors import GnssSpec
 from terrafusion.twin.model.motion import BodyMotion
@@ -22,9 +23,6 @@ from terrafusion.twin.sensors.noise import (
     rows_at_rate,
     sample_rate_hz,
 )
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 RTK_SIGMA_M, DGPS_SIGMA_M = 0.05, 0.5
 """A receiver whose best sigma is at most this reports fixed, or differential, fixes."""

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.sensors.noise import NoiseStreams, band_noise, flicker, stepped, white_and_walk
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 ACCEL_SHAPE = (0.9, 1.0, 1.0)
 """Vibration of the specific force along body x, y, z relative to vertical (assumed)."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 from terrafusion.twin.model.ground import random_stream
-
-Array = NDArray[np.float64]
 
 PLANE_WAVES = 24
 """Waves in the sum of `place_field`."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Steering
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.scenario.commands import wheel_angles
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz
-
-Array = NDArray[np.float64]
 
 
 def steering_channel(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.readers.ros.arriving import RawMessage
-
-Array = NDArray[np.float64]
 
 STATIC = ("/tf_static", "tf2_msgs/msg/TFMessage")
 RIGHT_ANGLE = 0.01

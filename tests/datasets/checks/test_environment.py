@@ -12,13 +12,13 @@ from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.checks.environment import circle
 from terrafusion.datasets.checks.summary import summarise
 from terrafusion.datasets.core.channels import Barometer, Imu, Magnetometer
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 from tests.datasets.ros_bags import MAKE1, MAKE2, T0, Make, Message, imu_messages, write_ros1, write_ros2
+from tests.differences import differences
 
 HORIZONTAL_T, VERTICAL_T = 19.1e-6, -45.7e-6
 

@@ -14,11 +14,11 @@ from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.core.channels import Fix, Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import AXES, Rig, axes_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
+from tests.differences import differences
 
 TRACK_M = 0.555
 HUSKY_AXES = ("-z", "-x", "+y")

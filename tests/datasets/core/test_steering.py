@@ -9,7 +9,6 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from terrafusion.datasets.core.channels import Steering, Wheels
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.messages import SteeringSample
 from terrafusion.datasets.core.recording import Overrides, Recording
@@ -17,6 +16,7 @@ from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros.joints import steering_joints
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 from tests.datasets.ros_bags import MAKE1, MAKE2, ROS1, ROS2, T0, imu_messages, write_ros1, write_ros2
+from tests.differences import differences
 
 DEFINITION = """float32 steering_angle
 float32 steering_angle_velocity

@@ -15,11 +15,11 @@ from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import borealtc_csv
+from tests.differences import differences
 
 IMU_HEADER, PRO_HEADER = "time,wx,wy,wz,ax,ay,az", "time,curL,curR,velL,velR"
 SECONDS, TRACK_M = 60.0, 0.8

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.catalog.catalog import locate
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.writers import write_log_folder
 from tests.datasets.comma_files import RATE_RADPS, RATIO, SPEED_MPS, UTC_S, WHEELBASE_M, write_segment
+from tests.differences import differences
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import pytest
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
+from tests.differences import differences
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
 

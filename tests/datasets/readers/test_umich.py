@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import umich_text
+from tests.differences import differences
 
 START_S = 1_652_300_000
 FAMILY = ("trial4_wheel_imu.txt", "trial4_wheel_vel.txt", "trial4_loop_center.txt", "trial4_loop_front.txt")

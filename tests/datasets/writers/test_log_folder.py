@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from terrafusion.datasets.core.channels import Command, Fix, Gnss, Imu, Terrain, Wheels
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import log_folder, write_log_folder
+from tests.differences import differences
 
 
 def test_round_trip_keeps_everything(drive: Recording, tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_typestore
 
 from terrafusion.datasets.core.channels import Imu, Wheels
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig
@@ -29,6 +28,7 @@ from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import ros_messages, write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.datasets.writers.tum import write_tum
+from tests.differences import differences
 
 
 def test_round_trip(drive: Recording, tmp_path: Path) -> None:

@@ -24,12 +24,12 @@ from terrafusion.datasets.core.channels import (
     Terrain,
     Wheels,
 )
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.recording import ClockJump, Overrides, Recording
 from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
+from tests.differences import differences
 
 S = 10**9
 NUMBERS = st.one_of(

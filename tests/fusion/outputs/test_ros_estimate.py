@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level
 from terrafusion.fusion.outputs.ros_estimate import diagnostic_rows, written_estimate
+from tests.differences import differences
 
 
 def with_outage(d: Any, first: int = 405, last: int = 705) -> Any:

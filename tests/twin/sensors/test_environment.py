@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import terrafusion.twin.params
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa, pressure_at
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
@@ -24,6 +23,7 @@ from terrafusion.twin.run_recording import DATUM
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.sensors.environment import DECLINATION_RAD, FIELD_SIZE_T, earth_field_t
 from terrafusion.twin.simulate import simulate
+from tests.differences import differences
 
 CIRCLE = Scenario("circle", 60.0, drive=(DriveSegment(60.0, 1.0, 0.2),), route=(RouteLeg("asphalt"),))
 

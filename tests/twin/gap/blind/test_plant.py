@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.strategies import floats, sampled_from
 
-from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.gap.blind.plant import contact
 from terrafusion.twin.gap.blind.plant.field import PlantSoilField
@@ -23,6 +22,7 @@ from terrafusion.twin.gap.blind.plant.run import record, simulate
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, stacked_numbers
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
+from tests.differences import differences
 from tests.studies.blind.plant_against_twin import steady_differences
 
 PLANT = Path(__file__).parents[4] / "twin" / "gap" / "blind" / "plant"
