@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.heap import older_objects_unsearched
 from terrafusion.datasets.core.messages import MagnetometerSample, Message
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples
@@ -104,10 +105,20 @@ def feed(
     """
     clock = recording.imu if recording.imu is not None else recording.wheels
     assert clock is not None
-    first_ns, last_ns = int(clock.t_ns[0]), int(clock.t_ns[-1])
+    with older_objects_unsearched():
+        return _fed(estimator, recording.messages(), int(clock.t_ns[0]), int(clock.t_ns[-1]), progress)
+
+
+def _fed(
+    estimator: Estimator,
+    messages: Iterator[Message],
+    first_ns: int,
+    last_ns: int,
+    progress: Callable[[float], None] | None,
+) -> np.ndarray:
     latencies: list[float] = []
     newest = estimator.latest()
-    for message in _until(recording.messages(), last_ns):
+    for message in _until(messages, last_ns):
         begun = time.perf_counter()
         if isinstance(message, MagnetometerSample):
             estimator.add_magnetic_field(*message)

@@ -17,8 +17,9 @@ from scipy.linalg import lapack
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
-from terrafusion.fusion.graph.chain import Chain, carried_prior
+from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.keyframe_rows import carried_prior
 from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
 
 BLOCK = 500

@@ -14,6 +14,7 @@ velocity and bias are GTSAM variables; the linear states live in the chain alone
 from __future__ import annotations
 
 import bisect
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -24,23 +25,17 @@ from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import lapack
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import BIAS, IMU_ROTATION, NAV, POSE, VELOCITY, KeyState, dim_of, skew
+from terrafusion.fusion.graph.key_state import BIAS, NAV, POSE, VELOCITY, KeyState, dim_of
+from terrafusion.fusion.graph.keyframe_rows import SYMBOLS, carried_prior, link_rows, measured_rows, own_rows
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement, linearised
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 _ZERO = np.zeros(3)
-
-
-_SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
-WHEEL_ROWS = 4
-_OF_IMU_FACTOR = np.r_[0:9, 18:24, 9:18, 24:31]
-"""Columns of a `CombinedImuFactor` (X, V, X, V, B, B, right-hand side) in the order X, V, B of both."""
 
 
 class Chain:
@@ -145,11 +140,18 @@ class Chain:
         return self.nodes[k - self.first].state()
 
     def covariance(self) -> Array:
-        """Marginal covariance (dim, dim) of the newest keyframe."""
+        """Marginal covariance (dim, dim) of the newest keyframe, read-only."""
+        return self._covariance
+
+    @functools.cached_property
+    def _covariance(self) -> Array:
+        """Dropped where the root changes."""
         inverse, info = lapack.dtrtri(self._root[:, : self.dim])
         if info:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
-        return np.asarray(inverse @ inverse.T)
+        covariance = np.asarray(inverse @ inverse.T)
+        covariance.flags.writeable = False
+        return covariance
 
     def covariance_at(self, k: int) -> Array:
         """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
@@ -185,21 +187,24 @@ class Chain:
 
     def _eliminate_all(self) -> None:
         """Eliminate what changed, and solve for the newest keyframe."""
+        if self._dirty > self.last:
+            return
         self._insert_new()
         for k in range(max(self._dirty, self.first), self.last):
             self._eliminate(k)
-        self._dirty = self.last
         node = self.nodes[-1]
         # What elimination leaves of the keyframes before is a triangle: alone it is the root itself.
-        alone = len(self.nodes) > 1 and not self._measured_rows(self.last)
-        self._root = node.prior if alone else triangular(self._own_rows(self.last))
+        alone = len(self.nodes) > 1 and not measured_rows(node, self.last, self.values)
+        self._root = node.prior if alone else triangular(own_rows(node, self.last, self.values))
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
+        self._dirty = self.last + 1
+        vars(self).pop("_covariance", None)
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
         while len(self.nodes) > keep and self._dirty > self.first:
             if self.first < self._inserted:
-                for symbol, _ in _SYMBOLS.values():
+                for symbol, _ in SYMBOLS.values():
                     self.values.erase(symbol(self.first))
             self.nodes.pop(0)
             self.first += 1
@@ -214,7 +219,7 @@ class Chain:
         self._eliminate_all()
         k = self.last if k is None else k
         node = self.nodes[k - self.first]
-        known = self._root if k == self.last else triangular(self._own_rows(k))
+        known = self._root if k == self.last else triangular(own_rows(node, k, self.values))
         inverse, _ = lapack.dtrtri(known[:, : self.dim])
         mean = inverse @ known[:, self.dim]
         stays = ~np.isin(np.arange(self.dim), anew)
@@ -332,94 +337,12 @@ class Chain:
         self.values.update(V(k), node.point.velocity)
         self.values.update(B(k), node.point.bias)
 
-    def _own_rows(self, k: int, further: int = 0, width: int = 1) -> Array:
-        """Prior and whitened rows over keyframe k alone, the last column being the right-hand side.
-
-        Shape (m + `further`, `width` dim + 1); the `further` rows are left free.
-        """
-        node, dim = self.nodes[k - self.first], self.dim
-        blocks = [node.prior, *self._measured_rows(k)]
-        rows = np.zeros((sum(map(len, blocks)) + further, width * dim + 1), order="F")
-        begin = 0
-        for block in blocks:
-            end = begin + len(block)
-            rows[begin:end, :dim], rows[begin:end, -1] = block[:, :dim], block[:, dim]
-            begin = end
-        return rows
-
-    def _measured_rows(self, k: int) -> list[Array]:
-        """Whitened rows (m, dim + 1) of the factors that touch keyframe k alone."""
-        node, dim = self.nodes[k - self.first], self.dim
-        held = node.held_rows()
-        if held is not None:
-            return held
-        blocks = [self._gtsam_rows(k)] if node.unary_keys else []
-        blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
-        blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
-        return node.hold_rows(blocks)
-
-    def _gtsam_rows(self, k: int) -> Array:
-        node = self.nodes[k - self.first]
-        present = [name for name in "XVB" if name in node.unary_keys]
-        ordering = gtsam.Ordering()
-        for name in present:
-            ordering.push_back(_SYMBOLS[name][0](k))
-        packed = node.unary.linearize(self.values).augmentedJacobian(ordering)
-        rows = np.zeros((len(packed), self.dim + 1))
-        column = 0
-        for name in present:
-            place = _SYMBOLS[name][1]
-            width = place.stop - place.start
-            rows[:, place] = packed[:, column : column + width]
-            column += width
-        rows[:, self.dim] = packed[:, -1]
-        return rows
-
-    def _linearised(self, k: int) -> Array:
-        """Whitened rows (n, 31) of the link over X, V and B of keyframe k - 1, then of k."""
-        link = self.nodes[k - self.first].link
-        if link.size() == 1 and self.nodes[k - self.first].preintegrated:
-            return np.asarray(link.at(0).linearize(self.values).augmentedJacobian()[:, _OF_IMU_FACTOR])
-        ordering = gtsam.Ordering()
-        for i in (k - 1, k):
-            for symbol in (X, V, B):
-                ordering.push_back(symbol(i))
-        return np.asarray(link.linearize(self.values).augmentedJacobian(ordering))
-
-    def _fill_link(self, k: int, rows: Array, packed: Array) -> None:
-        """Whitened rows over keyframes k - 1 and k, those of `_linearised` being `packed`."""
-        node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
-        n, dim = len(packed), self.dim
-        linear = dim - NAV.stop
-        rows[:n, NAV], rows[:n, dim : dim + NAV.stop] = packed[:, :15], packed[:, 15:30]
-        rows[:n, 2 * dim] = packed[:, 30]
-        if node.preintegrated and dim > IMU_ROTATION.start:
-            # The bias walk enters with opposite signs at both ends: their sum is what preintegration does
-            # with a bias, and a small rotation d of the IMU acts as the bias -d x measured.
-            by_bias = packed[:, 9:15] + packed[:, 24:30]
-            turn = by_bias[:, :3] @ skew(node.accel_mps2) + by_bias[:, 3:] @ skew(node.gyro_radps)
-            rows[:n, IMU_ROTATION] = turn
-            rows[:n, 2 * dim] -= turn @ before.point.of(IMU_ROTATION)
-        if node.markov is not None:
-            step, own = node.markov, rows[n : n + linear]
-            sigma, places = step.sigma[:linear], np.arange(linear)
-            own[places, 15 + places] = -step.decay[:linear] / sigma
-            own[places, dim + 15 + places] = 1.0 / sigma
-            own[:, 2 * dim] = -step.residual(before.point.linear, node.point.linear)[:linear] / sigma
-        if node.wheels is not None:
-            wheel = rows[n + linear : n + linear + WHEEL_ROWS]
-            left, H_i, H_j, H_linear = linearised(before.point, node.point, node.wheels)
-            sigma = node.wheels.sigma[:, None]
-            wheel[:, 0:6], wheel[:, dim : dim + 6] = H_i / sigma, H_j / sigma
-            wheel[:, dim + 15 : 2 * dim] = H_linear[:, :linear] / sigma
-            wheel[:, 2 * dim] = -left / node.wheels.sigma
-
     def _stacked(self, k: int) -> Array:
         """Prior and all whitened rows over keyframes k and k + 1, shape (m, 2 dim + 1)."""
-        packed = self._linearised(k + 1)
-        further = len(packed) + self.dim - NAV.stop + WHEEL_ROWS
-        stacked = self._own_rows(k, further, width=2)
-        self._fill_link(k + 1, stacked[len(stacked) - further :], packed)
+        node, after = self.nodes[k - self.first : k - self.first + 2]
+        link = link_rows(node, after, k + 1, self.values)
+        stacked = own_rows(node, k, self.values, len(link), width=2)
+        stacked[len(stacked) - len(link) :] = link
         return stacked
 
     def _eliminate(self, k: int) -> None:
@@ -436,12 +359,3 @@ class Chain:
             rhs = node.conditional[:, 2 * dim] - node.conditional[:, dim : 2 * dim] @ following
             node.delta = following = back_substitute(node.conditional[:, :dim], rhs)
         return begin
-
-
-def carried_prior(rows: Array, offset: Array) -> Array:
-    """Whitened rows (m, dim + 1) at a state that lies `offset` from where they were made."""
-    dim = rows.shape[1] - 1
-    out = rows.copy()
-    out[:, dim] -= rows[:, :dim] @ offset[:dim]
-    out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
-    return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, field
 
 import gtsam
@@ -55,6 +56,17 @@ class Node:
     def hold_rows(self, rows: list[Array]) -> list[Array]:
         """Keep the whitened rows of its own factors, beside the fields."""
         vars(self)["_rows"] = self.point, rows
+        return rows
+
+    def held_link(self, made_of: tuple[object, ...]) -> Array | None:
+        """The whitened rows of its link, while what they were made of is the same."""
+        held: tuple[tuple[object, ...], Array] | None = vars(self).get("_link")
+        same = held is not None and all(map(operator.is_, held[0], made_of))
+        return held[1] if held is not None and same else None
+
+    def hold_link(self, made_of: tuple[object, ...], rows: Array) -> Array:
+        """Keep the whitened rows of its link, beside the fields."""
+        vars(self)["_link"] = made_of, rows
         return rows
 
     def forget_rows(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.heap import older_objects_unsearched
 from terrafusion.datasets.core.messages import ImuSample, Message
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -101,6 +102,13 @@ def run(
     realtime: bool = False,
 ) -> Latencies:
     """Feed messages as they arrive and publish odometry after every IMU sample, once there is a start."""
+    with older_objects_unsearched():
+        return _run(estimator, messages, publish, realtime)
+
+
+def _run(
+    estimator: Estimator, messages: Iterable[Message], publish: Callable[[State], None], realtime: bool
+) -> Latencies:
     taken, began, first_ns = Latencies(), time.perf_counter(), None
     for message in messages:
         first_ns = message.t_ns if first_ns is None else first_ns

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from terrafusion.datasets.core.heap import older_objects_unsearched
 from terrafusion.datasets.readers.ros.static_frames import STATIC
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.dds import DdsBus
@@ -27,11 +28,12 @@ def serve(bus: DdsBus, node: LiveNode, stopped: Callable[[], bool]) -> None:
             bus.subscribe(topic, msgtype)
     for topic, msgtype in published.TYPES.items():
         bus.advertise(node.named(topic), msgtype)
-    while not stopped():
-        for topic, msgtype, latched in bus.discovered():
-            if node.wants(topic, msgtype):
-                bus.subscribe(topic, msgtype, latched)
-        bus.poll(node.receive, WAIT_S)
-        node.tick(time.monotonic())
+    with older_objects_unsearched():
+        while not stopped():
+            for topic, msgtype, latched in bus.discovered():
+                if node.wants(topic, msgtype):
+                    bus.subscribe(topic, msgtype, latched)
+            bus.poll(node.receive, WAIT_S)
+            node.tick(time.monotonic())
     bus.poll(node.receive)
     node.close()

@@ -10,18 +10,20 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gnss_factor, velocity_factor
+from terrafusion.fusion.graph import gnss_factor, keyframe_rows, velocity_factor
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import markov_step
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
+from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 from tests import gtsam_factors
 
 Array = NDArray[np.float64]
 N = len(LINEAR)
+NS = 100_000_000
 STEP = markov_step(
     0.1,
     mean=[0.05, 0.0, 0.0, -0.3, *[0.0] * (N - 4)],
@@ -170,6 +172,42 @@ def test_filter_ends_where_the_batch_ends() -> None:
     sigma = np.sqrt(np.diag(whole.covariances()[-1]))
     assert (np.abs(a.local(b)) < 0.1 * sigma).all()
     np.testing.assert_allclose(np.sqrt(np.diag(live.covariance())), sigma, rtol=0.1)
+
+
+def test_a_late_fix_linearises_no_link_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does what it gives depend on that: another wheel increment is seen."""
+    points, links, wheels, fixes = drive(8, seed=3)
+    made: list[int] = []
+    whole = keyframe_rows.linearised_link
+    monkeypatch.setattr(Chain, "RELINEARISE", np.full(15, np.inf))
+
+    def counted(node: Node, k: int, values: gtsam.Values) -> Array:
+        made.append(k)
+        return whole(node, k, values)
+
+    monkeypatch.setattr(keyframe_rows, "linearised_link", counted)
+
+    def solved(late: bool) -> Chain:
+        chain = Chain()
+        for k, point in enumerate(points):
+            chain.append(k * NS, point, *steps(links, wheels, k))
+            if k == 0:
+                chain.set_prior(SIGMAS[: chain.dim])
+            chain.solve(1)
+        made.clear()
+        fix = GnssPosition(fixes[4], np.zeros(3), np.full(3, 0.3))
+        chain.add_fix(4, fix)
+        if late:
+            chain.solve(1)
+            assert not made
+        chain.revise(6, wheels=wheels[5].with_extra_variance(1.0))
+        chain.solve(1)
+        return chain
+
+    once, twice = solved(late=False), solved(late=True)
+    assert made == [6]
+    assert (once.nodes[-1].delta == twice.nodes[-1].delta).all()
+    assert (once.covariance() == twice.covariance()).all()
 
 
 def test_forgetting_keeps_the_information() -> None:

@@ -1,0 +1,122 @@
+"""Whitened rows of one keyframe of the chain, at its linearisation point.
+
+The last column of rows is the right-hand side; rows over two keyframes have the older one's columns first.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.graph import gnss_factor, velocity_factor
+from terrafusion.fusion.graph.key_state import BIAS, IMU_ROTATION, NAV, POSE, VELOCITY, skew
+from terrafusion.fusion.graph.node import Node
+from terrafusion.fusion.graph.wheel_factor import linearised
+
+SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
+WHEEL_ROWS = 4
+
+
+def own_rows(node: Node, k: int, values: gtsam.Values, further: int = 0, width: int = 1) -> Array:
+    """Prior and rows over keyframe k alone, shape (m + `further`, `width` dim + 1), the last ones free."""
+    dim = len(node.delta)
+    blocks = [node.prior, *measured_rows(node, k, values)]
+    rows = np.zeros((sum(map(len, blocks)) + further, width * dim + 1), order="F")
+    begin = 0
+    for block in blocks:
+        end = begin + len(block)
+        rows[begin:end, :dim], rows[begin:end, -1] = block[:, :dim], block[:, dim]
+        begin = end
+    return rows
+
+
+def measured_rows(node: Node, k: int, values: gtsam.Values) -> list[Array]:
+    """Rows (m, dim + 1) of the factors that touch keyframe k alone."""
+    held = node.held_rows()
+    if held is not None:
+        return held
+    dim = len(node.delta)
+    blocks = [_gtsam_rows(node, k, values)] if node.unary_keys else []
+    blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
+    blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
+    return node.hold_rows(blocks)
+
+
+def _gtsam_rows(node: Node, k: int, values: gtsam.Values) -> Array:
+    dim, present = len(node.delta), [name for name in "XVB" if name in node.unary_keys]
+    ordering = gtsam.Ordering()
+    for name in present:
+        ordering.push_back(SYMBOLS[name][0](k))
+    packed = node.unary.linearize(values).augmentedJacobian(ordering)
+    rows = np.zeros((len(packed), dim + 1))
+    column = 0
+    for name in present:
+        place = SYMBOLS[name][1]
+        width = place.stop - place.start
+        rows[:, place] = packed[:, column : column + width]
+        column += width
+    rows[:, dim] = packed[:, -1]
+    return rows
+
+
+def link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
+    """Rows (m, 2 dim + 1) of all that links keyframe k - 1, `before`, and keyframe k."""
+    made_of = before.point, node.point, node.link, node.link.size(), node.markov, node.wheels
+    held = node.held_link(made_of)
+    if held is not None:
+        return held
+    dim, packed = len(node.delta), linearised_link(node, k, values)
+    n, linear = len(packed), dim - NAV.stop
+    rows = np.zeros((n + linear + WHEEL_ROWS, 2 * dim + 1), order="F")
+    _fill_navigation(rows[:n], packed, before, node)
+    if node.markov is not None:
+        step, own = node.markov, rows[n : n + linear]
+        sigma, places = step.sigma[:linear], np.arange(linear)
+        own[places, 15 + places] = -step.decay[:linear] / sigma
+        own[places, dim + 15 + places] = 1.0 / sigma
+        own[:, 2 * dim] = -step.residual(before.point.linear, node.point.linear)[:linear] / sigma
+    if node.wheels is not None:
+        wheel = rows[n + linear :]
+        left, H_i, H_j, H_linear = linearised(before.point, node.point, node.wheels)
+        sigma = node.wheels.sigma[:, None]
+        wheel[:, 0:6], wheel[:, dim : dim + 6] = H_i / sigma, H_j / sigma
+        wheel[:, dim + 15 : 2 * dim] = H_linear[:, :linear] / sigma
+        wheel[:, 2 * dim] = -left / node.wheels.sigma
+    return node.hold_link(made_of, rows)
+
+
+def linearised_link(node: Node, k: int, values: gtsam.Values) -> Array:
+    """Rows (n, 31) of GTSAM's link over X, V and B of keyframe k - 1, then of k."""
+    link = node.link
+    if link.size() == 1 and node.preintegrated:  # over X, V, X, V, B, B
+        rows = link.at(0).linearize(values).augmentedJacobian()
+        return np.hstack([rows[:, :9], rows[:, 18:24], rows[:, 9:18], rows[:, 24:]])
+    ordering = gtsam.Ordering()
+    for i in (k - 1, k):
+        for symbol in (X, V, B):
+            ordering.push_back(symbol(i))
+    return np.asarray(link.linearize(values).augmentedJacobian(ordering))
+
+
+def _fill_navigation(rows: Array, packed: Array, before: Node, node: Node) -> None:
+    dim = len(node.delta)
+    rows[:, NAV], rows[:, dim : dim + NAV.stop] = packed[:, :15], packed[:, 15:30]
+    rows[:, 2 * dim] = packed[:, 30]
+    if node.preintegrated and dim > IMU_ROTATION.start:
+        # The bias walk enters with opposite signs at both ends: their sum is what preintegration does
+        # with a bias, and a small rotation d of the IMU acts as the bias -d x measured.
+        by_bias = packed[:, 9:15] + packed[:, 24:30]
+        turn = by_bias[:, :3] @ skew(node.accel_mps2) + by_bias[:, 3:] @ skew(node.gyro_radps)
+        rows[:, IMU_ROTATION] = turn
+        rows[:, 2 * dim] -= turn @ before.point.of(IMU_ROTATION)
+
+
+def carried_prior(rows: Array, offset: Array) -> Array:
+    """Rows (m, dim + 1) of a prior at a state that lies `offset` from where they were made."""
+    dim = rows.shape[1] - 1
+    out = rows.copy()
+    out[:, dim] -= rows[:, :dim] @ offset[:dim]
+    out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
+    return out
