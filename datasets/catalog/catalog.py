@@ -53,40 +53,47 @@ class CatalogFile:
 
 @dataclass(frozen=True)
 class SetVariant:
-    """What holds for some recordings of a set only."""
+    """What holds for some recordings of a set only, as under `cases` in `catalog.yaml`."""
 
-    conventions: dict[str, Any] = field(default_factory=dict)
+    conventions: Conventions = field(default_factory=Conventions)
     note: str = ""
 
 
 @dataclass(frozen=True)
-class DataSet:
-    """One set of recordings.
+class SetFile:
+    """Keys of a set in `catalog.yaml`.
 
     Attributes:
-        name, title, holds, licence, citation, homepage: texts for people.
+        title, holds, licence, citation, homepage: texts for people.
         format: the reader's name; files of this format that are not in the catalogue are read
             with the conventions of the set, with a note.
         conventions: hold for all its recordings.
         cases: by pattern of the recording's name (as in a shell), what differs there.
     """
 
-    name: str
     title: str
     holds: str
     licence: str
     citation: str
     homepage: str
     format: str
-    conventions: dict[str, Any]
-    cases: dict[str, SetVariant]
+    conventions: Conventions = field(default_factory=Conventions)
+    cases: dict[str, SetVariant] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DataSet(SetFile):
+    """One set of recordings; `content` is what the file gives: a variant changes only what it gives."""
+
+    name: str = ""
+    content: dict[str, Any] = field(default_factory=dict)
 
     def conventions_of(self, recording: str = "") -> Conventions:
         """The conventions of one recording, or of an unknown one of the same kind."""
-        merged = dict(self.conventions)
-        for pattern, case in self.cases.items():
+        merged = dict(self.content.get("conventions", {}))
+        for pattern, case in self.content.get("cases", {}).items():
             if fnmatch.fnmatchcase(recording, pattern):
-                merged |= case.conventions
+                merged |= case.get("conventions", {})
         return structure(Conventions, merged, file="catalog.yaml", key=f"{self.name}.conventions")
 
     def notes_of(self, recording: str) -> tuple[str, ...]:
@@ -149,36 +156,10 @@ def _load(own: str) -> Catalog:
     return Catalog(sets, tuple(files))
 
 
-@dataclass(frozen=True)
-class VariantFile:
-    """Keys of a variant (`cases`) in `catalog.yaml`."""
-
-    conventions: Conventions = field(default_factory=Conventions)
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class SetFile:
-    """Keys of a set in `catalog.yaml`."""
-
-    title: str
-    holds: str
-    licence: str
-    citation: str
-    homepage: str
-    format: str
-    conventions: Conventions = field(default_factory=Conventions)
-    cases: dict[str, VariantFile] = field(default_factory=dict)
-
-
 def _read_sets(path: Path) -> dict[str, DataSet]:
     content = read_yaml(path)
-    structure(dict[str, SetFile], content, file=path)
-    sets = {}
-    for name, raw in content.items():
-        cases = {p: SetVariant(**case) for p, case in raw.get("cases", {}).items()}
-        sets[name] = DataSet(**{"conventions": {}} | raw | {"name": name, "cases": cases})
-    return sets
+    found = structure(dict[str, SetFile], content, file=path)
+    return {name: DataSet(**vars(found[name]), name=name, content=raw) for name, raw in content.items()}
 
 
 def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:

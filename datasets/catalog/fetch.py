@@ -26,6 +26,7 @@ from terrafusion.datasets.catalog.catalog import (
     load_catalog,
 )
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.files import unwritable
 
 CONNECT_S, SILENCE_S = 10.0, 30.0
 """A server that does not answer, or falls silent, for longer has failed."""
@@ -118,16 +119,8 @@ def _brought(entry: CatalogFile, folder: Path) -> Path | None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(here, target)
     except OSError as error:
-        raise _unwritable(target, error) from None
+        raise unwritable(target, error) from None
     return target
-
-
-def _unwritable(path: Path, error: OSError) -> DataError:
-    return DataError(
-        f"cannot be written: {error.strerror or error}",
-        file=path,
-        remedy="choose a folder you may write to, with room on the disk",
-    )
 
 
 def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Path:
@@ -147,7 +140,7 @@ def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Pa
             remedy="run it again, which goes on where it stopped, or put the file into TERRAFUSION_DATA",
         ) from None
     except OSError as error:
-        raise _unwritable(folder / entry.file, error) from None
+        raise unwritable(folder / entry.file, error) from None
     except ValueError:  # pooch found another hash, and has removed what came
         raise DataError(
             f"what came from {entry.url()} has another SHA-256 than the catalogue",

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.scratch import sweep
 
 
@@ -15,7 +15,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     """Let `write` fill a file beside `path`, then rename it to `path`; missing folders are made.
 
     Raises:
-        TerrafusionError: the folder cannot be made or written.
+        DataError: the folder cannot be made or written.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -43,7 +43,7 @@ def check_folder(path: Path) -> None:
     """Refuse an unusable output folder before anything is computed; a missing one is not created yet.
 
     Raises:
-        TerrafusionError: it cannot be made or written.
+        DataError: it cannot be made or written.
     """
     try:
         there = next(place for place in (path, *path.absolute().parents) if place.exists())
@@ -52,9 +52,9 @@ def check_folder(path: Path) -> None:
         raise unwritable(path, error) from None
 
 
-def unwritable(path: Path, error: OSError) -> TerrafusionError:
+def unwritable(path: Path, error: OSError) -> DataError:
     """The error that states why `path` cannot be written."""
-    return TerrafusionError(
+    return DataError(
         f"cannot be written: {error.strerror or error}",
         file=path,
         remedy="choose a folder you may write to, with room on the disk",

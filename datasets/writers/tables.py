@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.files import unwritable
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import (
@@ -40,11 +41,7 @@ def writing(path: Path) -> Iterator[None]:
             remedy="take it out of the texts of the recording",
         ) from None
     except OSError as error:
-        raise DataError(
-            f"cannot be written: {error.strerror or error}",
-            file=path,
-            remedy="choose a folder you may write to, with room on the disk",
-        ) from None
+        raise unwritable(path, error) from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
+from terrafusion.datasets.core.tables import markdown_table, text_table
 from terrafusion.twin.analysis.speeds import OTHERS, USUAL
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.claims import PREDICTED, ClaimResult, counts
@@ -13,7 +14,6 @@ from terrafusion.twin.study.published import CASES, StudyCase
 from terrafusion.twin.study.spread import spread
 from terrafusion.twin.study.study import Study
 
-BAR = "\\|"
 TAB4_HEAD = ("", "|s|", "odometry", "IMU", "GNSS, RTK", "GNSS, Gaussian", "stopped for good at")
 ASSUMED_COLUMNS = ("slip", "imu", "gnss")
 ASSUMED_HEAD = (
@@ -31,9 +31,7 @@ def study_lines(study: Study) -> list[str]:
     """Tab. 4 side by side, the GNSS noise, and how much agrees."""
     seeds = study.plan.seed_count()
     lines = [f"mean %, twin / study; {seeds} seeds, 95 % interval of the mean"]
-    rows = [list(TAB4_HEAD), *([case.label, *table_cells(study, case)] for case in CASES)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(TAB4_HEAD))]
-    lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines += text_table(TAB4_HEAD, [[case.label, *table_cells(study, case)] for case in CASES])
     return [*lines, "", noise_sentence(study), *count_lines(study.rows)]
 
 
@@ -102,29 +100,22 @@ def count_lines(rows: Sequence[ClaimResult]) -> list[str]:
 
 def markdown_rows(rows: Sequence[ClaimResult], columns: Sequence[str] = COLUMNS) -> list[str]:
     """The table of agreement in Markdown."""
-    return _markdown(columns, [[str(getattr(row, column)) for column in columns] for row in rows])
+    return markdown_table(columns, [[str(getattr(row, column)) for column in columns] for row in rows])
 
 
 def document_section(study: Study) -> list[str]:
     """What tests/studies/results/source_study.md holds between its marks: its tables and counts."""
     tab4 = [[case.label, *table_cells(study, case)] for case in CASES]
     return [
-        *_markdown(("mean %, twin / study", *TAB4_HEAD[1:]), tab4),
+        *markdown_table(("mean %, twin / study", *TAB4_HEAD[1:]), tab4),
         "",
         noise_sentence(study),
         "",
         "Tab. 4 under other cut-offs and thresholds of motion (GNSS is the data sheet's RTK):",
         "",
-        *_markdown(ASSUMED_HEAD, assumed_rows(study)),
+        *markdown_table(ASSUMED_HEAD, assumed_rows(study)),
         "",
         *(f"- {line}" for line in count_lines(study.rows)),
         "",
         *markdown_rows(study.rows),
     ]
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table in Markdown; bars inside cells are escaped."""
-    lines = [head, *rows]
-    text = [f"| {' | '.join(cell.replace('|', BAR) for cell in line)} |" for line in lines]
-    return [text[0], f"|{' --- |' * len(head)}", *text[1:]]

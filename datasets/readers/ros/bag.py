@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,25 +37,25 @@ LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
 
 
-def read_bag(request: Request, open_container: Callable[[Path], BagContainer], remedy: str) -> Recording:
-    """Read a bag of either ROS.
+@contextmanager
+def opened_bag(
+    path: Path, open_container: Callable[[Path], BagContainer], remedy: str
+) -> Iterator[BagContainer]:
+    """A bag of either ROS, open.
 
     Args:
-        request: the bag, the robot, topics and stamps.
+        path: the bag.
         open_container: opens the file or folder.
-        remedy: what to do about a bag that does not open.
+        remedy: what to do about a bag that does not open or breaks off.
 
     Raises:
-        DataError: a broken bag, no usable topic, or what the channels refuse.
+        DataError: a broken bag, also where that shows only while it is read.
     """
-    path = request.path
     try:
         with foreign():
             container = open_container(path)
-        try:
-            return recording_of(container, request)
-        finally:
-            container.close()
+        with closing(container):
+            yield container
     except BagError as error:
         what = f"cannot be read as a ROS bag: {error}"
         raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
@@ -117,34 +119,28 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
 
 def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | None) -> Recording:
     """One channel after the other; the order matters where one looks at another."""
-    streams, t = timing.streams, timing.times
-    imu = builder.imu(streams["imu"], t["imu"]) if "imu" in streams else None
-    wheels, track = None, None
-    if "wheels" in streams:
-        wheels, track = builder.wheels(streams["wheels"], t["wheels"], imu)
-    gnss, datum = None, builder.datum(datum_stream) if datum_stream is not None else None
-    if "gnss" in streams:
-        gnss, datum = builder.gnss(streams["gnss"], t["gnss"], datum)
-        if gnss is not None and "gnss_velocity" in streams:
-            gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], t["gnss_velocity"])
-    barometer = builder.barometer(streams["barometer"], t["barometer"]) if "barometer" in streams else None
-    magnetometer = None
-    if "magnetometer" in streams:
-        magnetometer = builder.magnetometer(streams["magnetometer"], t["magnetometer"])
-    truth, frame = None, "base"
-    if "truth" in streams:
-        truth, frame = builder.truth(streams["truth"], t["truth"])
+    streams = timing.streams
+
+    def built(kind: str, *beside: Any) -> Any:
+        """What the builder makes of the messages of a kind; None without any."""
+        return getattr(builder, kind)(streams[kind], timing.times[kind], *beside) if kind in streams else None
+
+    imu = built("imu")
+    wheels, track = built("wheels", imu) or (None, None)
+    datum = builder.datum(datum_stream) if datum_stream is not None else None
+    gnss, datum = built("gnss", datum) or (None, datum)
+    if gnss is not None and "gnss_velocity" in streams:
+        gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], timing.times["gnss_velocity"])
+    others = {kind: built(kind) for kind in ("barometer", "magnetometer")}
+    truth, frame = built("truth") or (None, "base")
+    others |= {kind: built(kind) for kind in ("command", "terrain", "steering")}
     return Recording(
         name=builder.file.stem,
         start_ns=builder.start_ns,
-        command=builder.command(streams["command"], t["command"]) if "command" in streams else None,
         wheels=wheels,
         imu=imu,
         gnss=gnss,
-        terrain=builder.terrain(streams["terrain"], t["terrain"]) if "terrain" in streams else None,
-        barometer=barometer,
-        magnetometer=magnetometer,
-        steering=builder.steering(streams["steering"], t["steering"]) if "steering" in streams else None,
+        **others,
         truth=truth,
         datum=datum,
         truth_channels=truth_contents(truth) if truth is not None else (),
@@ -153,7 +149,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),
         notes=tuple(builder.notes),
         clock_jumps=timing.jumps,
-        imu_frame_id=_usual_frame(streams["imu"]) if "imu" in streams else "",
+        imu_frame_id=_usual_frame(streams["imu"]) if imu is not None else "",
     )
 
 

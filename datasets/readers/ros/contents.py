@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import TimesNs
-from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.formats import Request, format_of
 from terrafusion.datasets.readers.open import find_log
 from terrafusion.datasets.readers.ros import ros1, ros2
-from terrafusion.datasets.readers.ros.bag import chosen_topics, topics_of
-from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
-from terrafusion.datasets.readers.ros.streams import foreign, read_streams
+from terrafusion.datasets.readers.ros.bag import chosen_topics, opened_bag, topics_of
+from terrafusion.datasets.readers.ros.streams import read_streams
 from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
 
@@ -61,7 +57,8 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         rivals[kind] = tuple(topic.name for topic in found)
         return found[0]
 
-    with _opened(path, form == "ros1") as container:
+    doors = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
+    with opened_bag(path, *doors[form]) as container:
         there = topics_of(container)
         chosen_topics(container, Request(path, topics=topics), open_to_the_user)
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
@@ -74,18 +71,3 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
             contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in there if topic not in usable)
     return BagContents(tuple(contents), unused, rivals)
-
-
-@contextmanager
-def _opened(path: Path, ros1_bag: bool) -> Iterator[BagContainer]:
-    remedy = ros1.REMEDY if ros1_bag else ros2.REMEDY
-    try:
-        with foreign():
-            container = ros1.Ros1File(path) if ros1_bag else ros2.open_container(path)
-        try:
-            yield container
-        finally:
-            container.close()
-    except BagError as error:
-        what = f"cannot be read as a ROS bag: {error}"
-        raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None

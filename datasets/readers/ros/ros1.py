@@ -17,7 +17,7 @@ import numpy as np
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.ros.bag import read_bag
+from terrafusion.datasets.readers.ros.bag import opened_bag, recording_of
 from terrafusion.datasets.readers.ros.raw import (
     BagError,
     BagSource,
@@ -50,7 +50,8 @@ def claims(path: Path, head: bytes) -> bool:
 
 def read(request: Request) -> list[Recording]:
     """The one recording of a ROS 1 bag."""
-    return [read_bag(request, Ros1File, REMEDY)]
+    with opened_bag(request.path, Ros1File, REMEDY) as container:
+        return [recording_of(container, request)]
 
 
 class _Chunk(NamedTuple):

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.ros.bag import read_bag
+from terrafusion.datasets.readers.ros.bag import opened_bag, recording_of
 from terrafusion.datasets.readers.ros.db3_file import Db3File
 from terrafusion.datasets.readers.ros.mcap_file import McapFile
 from terrafusion.datasets.readers.ros.raw import (
@@ -45,7 +45,8 @@ def read(request: Request) -> list[Recording]:
 
     Bags without message definitions (SQLite before ROS 2 Iron) are read with those of Humble.
     """
-    return [read_bag(request, open_container, REMEDY)]
+    with opened_bag(request.path, open_container, REMEDY) as container:
+        return [recording_of(container, request)]
 
 
 def open_container(path: Path) -> BagContainer:
