@@ -14,7 +14,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.assumptions import Assumption, assumptions
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
-from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.estimate.estimate import Estimate, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, with_usable_samples
 from terrafusion.fusion.estimator.history import History
@@ -84,6 +84,7 @@ def replay(
     settings: EstimatorOptions | None = None,
     grounds: GroundMemory | None = None,
     findings: Sequence[Finding] | None = None,
+    watch: Callable[[Estimator], None] | None = None,
 ) -> ReplayResult:
     """Estimate and score one run.
 
@@ -98,6 +99,7 @@ def replay(
         settings: fields of `EstimatorConfig` that are not its defaults.
         grounds: what the robot learned of its grounds on earlier drives.
         findings: of the log checks, where they are known already.
+        watch: called with the estimator after every keyframe.
 
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
@@ -113,7 +115,7 @@ def replay(
     )
 
     # Feed it as live; for a batch, then smooth the whole run.
-    run = _run_estimator(config, given, used, batch, progress)
+    run = _run_estimator(config, given, used, batch, progress, watch)
     estimator = run.estimator
 
     # Score it.
@@ -179,12 +181,19 @@ def _run_estimator(
     used: Gnss | None,
     batch: bool,
     progress: Callable[[float], None] | None,
+    watch: Callable[[Estimator], None] | None,
 ) -> _FinishedRun:
     """Feed the samples `given` as live; for a batch, then smooth the whole run."""
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
+
+    def keyframe(state: State) -> None:
+        history.add(state, estimator.weights.noise, estimator.weights.take_changes())
+        if watch is not None:
+            watch(estimator)
+
     estimator = Estimator(
         config,
-        on_state=lambda state: history.add(state, estimator.weights.noise, estimator.weights.take_changes()),
+        on_state=keyframe,
         on_innovation=history.innovations.append,
         archive=archive,
     )

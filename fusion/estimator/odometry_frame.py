@@ -15,7 +15,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import key_state_of
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import quaternion_of
+from terrafusion.fusion.graph.key_state import KeyState, quaternion_of
+from terrafusion.fusion.graph.triangular import back_substitute
 
 
 def in_map(frame: str) -> bool:
@@ -37,7 +38,7 @@ class OdometryFrame:
 
     def step(self, chain: Chain) -> None:
         """Take the newest keyframe, solved without the fixes that came with it."""
-        before = chain.state(chain.last - 1).pose
+        before = _smoothed_before(chain).pose
         begin = before if self._pose is None else self._pose
         self._pose = begin.compose(before.between(chain.state(chain.last).pose))
 
@@ -59,3 +60,15 @@ class OdometryFrame:
             velocity_covariance=turn @ now.velocity_covariance @ turn.T,
             covariance=np.full((6, 6), np.nan),
         )
+
+
+def _smoothed_before(chain: Chain) -> KeyState:
+    """The keyframe before the newest, as the newest solution has it: `Chain.solve` moves the newest alone.
+
+    A change of ground that is detected late moves both; their difference alone is the motion between them.
+    """
+    node, dim = chain.nodes[-2], chain.dim
+    assert node.conditional is not None
+    following = node.conditional[:, dim : 2 * dim] @ chain.nodes[-1].delta
+    delta = back_substitute(node.conditional[:, :dim], node.conditional[:, 2 * dim] - following)
+    return node.point.retract(delta)

@@ -50,9 +50,13 @@ def write_replay(out: Path, result: ReplayResult, provenance: Mapping[str, objec
 
 
 def write_comparison(
-    path: Path, title: str, results: Sequence[ReplayResult], provenance: Mapping[str, object] | None = None
+    path: Path,
+    title: str,
+    results: Sequence[ReplayResult],
+    provenance: Mapping[str, object] | None = None,
+    overview: tuple[Figure, str] | None = None,
 ) -> None:
-    """One report over several replays of the same drive."""
+    """One report over several replays of the same drive; see `write_report`."""
     first = results[0]
     policy = {"policy": first.policy.name, "policy inputs": first.policy.inputs_sha256}
     write_report(
@@ -64,6 +68,7 @@ def write_comparison(
         outages=first.outages,
         wheel_radius_m=first.vehicle.odometry.wheel_radius_m,
         provenance=policy | dict(provenance or {}),
+        overview=overview,
     )
 
 
@@ -77,6 +82,7 @@ def write_report(
     outages: Sequence[Outage] = (),
     wheel_radius_m: float | None = None,
     provenance: Mapping[str, object] | None = None,
+    overview: tuple[Figure, str] | None = None,
 ) -> Path:
     """Write the report to `path`.
 
@@ -87,6 +93,7 @@ def write_report(
         outages: the stretches without GNSS.
         wheel_radius_m: to show the speed of wheels logged in rad/s.
         provenance: further lines for the last section, such as the command line and hashes of inputs.
+        overview: a figure and its caption, to stand before the numbers.
 
     Raises:
         TerrafusionError: the file cannot be written.
@@ -109,7 +116,7 @@ def write_report(
     calibrations = {run.name: [cells(row) for row in run.metrics.get("calibration", ())] for run in runs}
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
-        runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
+        overview=overview, runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
         scores=rows, rivals=replay_text.shown_rivals(rows), figures=figures,
         verdicts=replay_text.verdicts([run.name for run in runs], metrics), assumed=_assumed(runs),
         reference=replay_text.REFERENCE[shown.scores.against or "truth"],

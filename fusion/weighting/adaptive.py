@@ -79,7 +79,7 @@ class TerrainNoise:
         self._before = self._shares
         self._next_ns = self._updated_ns = 0
         self._grade = 0.0
-        self._last_speed = 0.0
+        self._last_speed = np.nan
         self._source = "detector"
 
     def learn_slip(self, mean: float, sigma: float, t_ns: int) -> None:
@@ -160,7 +160,7 @@ class TerrainNoise:
             return
         before_ns, self._updated_ns = self._updated_ns, state.t_ns
         self._next_ns = state.t_ns + UPDATE_NS
-        window = self._window(state, imu, wheels)
+        window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
@@ -177,20 +177,21 @@ class TerrainNoise:
             self._label_probabilities = self._labels.probabilities(t_ns, self.detector.classes)
             self._source = "label"
 
-    def _window(self, state: State, imu: ImuStream, wheels: WheelStream) -> Window:
+    def _window(self, state: State, imu: ImuStream, wheels: WheelStream, dt_s: float) -> Window:
+        """The last second up to `state`, `dt_s` after the last update: slow wheels make rare keyframes."""
         start_ns, rig = state.t_ns - WINDOW_NS, self._rig
         t, gyro, accel = imu.window(start_ns, state.t_ns + 1)
         rolled = wheels.travelled(start_ns, state.t_ns)
         left, right = rolled if rolled is not None else (np.nan, np.nan)
         speed = 0.5 * (left + right) / (WINDOW_NS * 1e-9)
-        rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
-        self._last_speed = 0.0 if np.isnan(speed) else speed
+        rate = (speed - self._last_speed) / max(dt_s, UPDATE_NS * 1e-9)
+        self._last_speed = speed
         prior = self.noise.slip_at(self._grade), self.noise.slip_sigma
         observed = state.status == "running"  # without fixes the slip is what its prior says
         measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if observed else None
         slip, slip_sigma = measured if measured is not None else (None, None)
         return Window(
-            dt_s=UPDATE_NS * 1e-9,
+            dt_s=dt_s,
             imu_t_s=t,
             gyro_radps=gyro,
             accel_mps2=accel,

@@ -24,8 +24,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a demo run as the shell runs it, with every warning shown, and what it printed."""
     folder = tmp_path_factory.mktemp("demo")
     done = subprocess.run(
-        [sys.executable, "-c", ENTRY, "demo", "--out", "first"], capture_output=True, text=True, timeout=300,
-        check=False, cwd=folder, env=os.environ | {"PYTHONWARNINGS": "default"},
+        [sys.executable, "-c", ENTRY, "demo", "--out", "first", "--drives", "1"],
+        capture_output=True, text=True, timeout=900, check=False, cwd=folder,
+        env=os.environ | {"PYTHONWARNINGS": "default"},
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
     return folder / "first", done.stdout
@@ -37,9 +38,26 @@ def test_the_comparison_is_printed(demo: tuple[Path, str]) -> None:
     assert "asphalt, loose_sand, mud" in lines[0]
     assert lines[1].split() == ["fixed", "adaptive"]
     assert lines[-1] == f"report: {Path('first') / 'report.html'}"
-    for row in ("position error", "median error in the outage", "heading error", "real-time factor"):
+    for row in ("with GNSS", "in the outage", "at the end of the outage"):
+        line = next(line for line in lines if line.startswith(f"position error {row} (m)"))
+        assert len(re.findall(r"\d+\.\d\d \[\d+\.\d\d, \d+\.\d\d\]", line)) == 2, line
+    for row in ("position error, whole drive", "heading error", "real-time factor"):
         line = next(line for line in lines if line.startswith(row))
         assert len(re.findall(r"\d+\.\d\d", line)) == 2, line
+    assert (
+        sum(
+            line.startswith(("Where adaptive weights do not help", "Adaptive weights help")) for line in lines
+        )
+        == 1
+    )
+
+
+def test_the_odometry_frame_does_not_jump_where_gnss_comes_back(demo: tuple[Path, str]) -> None:
+    """A step takes a tenth of a second at 1.1 m/s; the map is corrected by more than that."""
+    _, out = demo
+    line = next(line for line in out.splitlines() if line.startswith("Largest step"))
+    map_m, odom_m = (float(x) for x in re.findall(r"(\d+\.\d\d) m", line))
+    assert odom_m < 0.15 < map_m
 
 
 def test_its_files(demo: tuple[Path, str]) -> None:
@@ -48,11 +66,12 @@ def test_its_files(demo: tuple[Path, str]) -> None:
         "log",
         "fixed",
         "adaptive",
+        "demo.png",
         "report.html",
         "config.json",
     }
     schema = json.loads((ROOT / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8"))
-    printed = next(line for line in out.splitlines() if line.startswith("position error")).split()[-2:]
+    printed = next(line for line in out.splitlines() if line.startswith("position error, whole")).split()[-2:]
     for mode, shown in zip(("fixed", "adaptive"), printed, strict=True):
         assert {path.name for path in (folder / mode).iterdir()} == FILES
         metrics = json.loads((folder / mode / "metrics.json").read_text())
@@ -63,6 +82,7 @@ def test_its_files(demo: tuple[Path, str]) -> None:
     report = (folder / "report.html").read_text(encoding="utf-8")
     assert "fixed" in report
     assert "adaptive" in report
+    assert "All drives" in report
     assert 'src="http' not in report
 
 
@@ -76,6 +96,6 @@ def test_its_log_can_be_read_again(demo: tuple[Path, str]) -> None:
 def test_it_runs_twice_into_the_same_folder(demo: tuple[Path, str], terrafusion) -> None:
     folder, _ = demo
     before = (folder / "fixed" / "estimate.csv").read_bytes()
-    outcome = terrafusion("demo", "--out", folder)
+    outcome = terrafusion("demo", "--out", folder, "--drives", "1")
     assert (outcome.status, outcome.err) == (0, "")
     assert (folder / "fixed" / "estimate.csv").read_bytes() == before

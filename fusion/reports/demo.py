@@ -1,0 +1,145 @@
+"""Several drives of the demo in one picture, one table and one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FIXED, ADAPTIVE = "fixed", "adaptive"
+EQUAL = 0.05
+"""Relative difference below which two errors count as equal."""
+_ODOM = "#009e73"
+
+
+@dataclass(frozen=True, eq=False)
+class DemoRun:
+    """One replay of one simulated drive.
+
+    Attributes:
+        seed, mode: which.
+        t_s, error_m: (n,) seconds from the start, and horizontal distance to the truth.
+        path_m, odom_m: (k, 2) path in the frames `map` and `odom` (REP-105), at the same keyframes.
+    """
+
+    seed: int
+    mode: str
+    t_s: Array
+    error_m: Array
+    path_m: Array
+    odom_m: Array
+
+    def errors(self, outage: Outage) -> dict[str, float]:
+        """Median error with GNSS, median in the outage and error at its end, m."""
+        end_s = outage.start_s + outage.seconds
+        inside = (self.t_s >= outage.start_s) & (self.t_s <= end_s)
+        last = int(np.flatnonzero(inside)[-1])
+        return {
+            "with GNSS": float(np.nanmedian(self.error_m[~inside])),
+            "in the outage": float(np.nanmedian(self.error_m[inside])),
+            "at the end of the outage": float(self.error_m[last]),
+        }
+
+    def largest_step_m(self, frame: str) -> float:
+        """Largest step between keyframes in the frame "map" or "odom"."""
+        path = self.path_m if frame == "map" else self.odom_m
+        return float(np.hypot(*np.diff(path, axis=0).T).max())
+
+
+Table = dict[str, dict[str, list[float]]]
+"""Row (of `DemoRun.errors`) -> mode -> errors (m), a drive each, seeds in order."""
+
+
+def table_of(runs: Sequence[DemoRun], outage: Outage) -> Table:
+    """The errors of all drives."""
+    found: Table = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        for row, error in run.errors(outage).items():
+            found.setdefault(row, {}).setdefault(run.mode, []).append(error)
+    return found
+
+
+def cell(errors: Sequence[float]) -> str:
+    """Median, and least to largest in brackets."""
+    low, high = min(errors), max(errors)
+    return f"{np.median(errors):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def where_it_does_not_help(table: Table) -> str:
+    """One sentence: in which rows and drives adaptive weights are no better than fixed ones."""
+    even, worse = [], []
+    for row, errors in table.items():
+        ratio = float(np.median(errors[ADAPTIVE])) / max(float(np.median(errors[FIXED])), 1e-9)
+        if abs(ratio - 1.0) <= EQUAL:
+            even.append(row)
+        elif ratio > 1.0:
+            worse.append(row)
+    end = table["at the end of the outage"]
+    pairs = list(zip(end[ADAPTIVE], end[FIXED], strict=True))
+    lost = sum(a > b for a, b in pairs)
+    parts = [f"it is even {_listed(even)}"] if even else []
+    parts += [f"it is worse {_listed(worse)}"] if worse else []
+    parts += [f"{lost} of {len(pairs)} drives end the outage with a larger error"] if lost else []
+    if not parts:
+        return "Adaptive weights help in every drive shown here; on firm ground they equal fixed ones."
+    return f"Where adaptive weights do not help: {'; '.join(parts)}."
+
+
+def _listed(rows: Sequence[str]) -> str:
+    return " and ".join(rows)
+
+
+def plot_demo(runs: Sequence[DemoRun], shown_seed: int, recording: Recording, outage: Outage) -> Figure:
+    """Paths of one drive beside the errors of all drives, and the step from keyframe to keyframe."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(11.0, 5.4), layout="constrained")
+    left, right = fig.subplots(1, 2, width_ratios=(1.15, 1.0))
+    shown = {run.mode: run for run in runs if run.seed == shown_seed}
+    _plot_paths(left, shown, recording)
+    _plot_errors(right, runs, outage)
+    return fig
+
+
+def _plot_paths(ax: Axes, shown: Mapping[str, DemoRun], recording: Recording) -> None:
+    truth = recording.truth
+    if truth is not None:
+        xy = truth.position_m[style.thin(len(truth)), :2]
+        ax.plot(*xy.T, color=style.TRUTH, linewidth=3.0, alpha=0.25, label="truth")
+    for mode, run in shown.items():
+        ax.plot(*run.path_m.T, color=style.colour_of(mode, style.MODE_COLOURS), linewidth=1.2, label=mode)
+    if ADAPTIVE in shown:
+        odom = shown[ADAPTIVE].odom_m
+        look: dict[str, Any] = {"color": _ODOM, "linewidth": 1.0, "linestyle": (0, (4, 2))}
+        ax.plot(*odom.T, label="adaptive, odometry frame", **look)
+    ax.set_aspect("equal", adjustable="datalim")
+    style.format_axes(ax, x="east, m", y="north, m")
+    style.legend_above(ax, columns=4)
+
+
+def _plot_errors(ax: Axes, runs: Sequence[DemoRun], outage: Outage) -> None:
+    shade_outages(ax, [outage])
+    for mode in (FIXED, ADAPTIVE):
+        own = [run for run in runs if run.mode == mode]
+        t_s = own[0].t_s
+        errors = np.array([np.interp(t_s, run.t_s, run.error_m) for run in own])
+        colour = style.colour_of(mode, style.MODE_COLOURS)
+        rows = style.thin(len(t_s))
+        low, middle, high = np.nanmin(errors, 0), np.nanmedian(errors, 0), np.nanmax(errors, 0)
+        ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, alpha=0.18, linewidth=0)
+        ax.plot(t_s[rows], middle[rows], color=colour, linewidth=1.6, label=f"{mode}: median, range")
+    ax.set_ylim(bottom=0.0)
+    style.format_axes(ax, x=TIME, y=f"position error of {len(runs) // 2} drives, m")
+    style.legend_above(ax, columns=3)
