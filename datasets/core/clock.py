@@ -32,31 +32,14 @@ LEAP_PERIODS, LEAP_S = 10, 0.5
 MAX_STEPS = 1000
 
 
-def repair(t_ns: TimesNs, channel: str, *, forwards: bool = False) -> tuple[TimesNs, tuple[ClockJump, ...]]:
-    """Remove the clock steps of one channel.
-
-    Args:
-        t_ns: (N,) int64 in the order of the rows.
-        channel: its name, for the jumps and errors.
-        forwards: remove jumps ahead too. Times alone do not distinguish a jump from a gap in the data.
-
-    Returns:
-        The repaired times, and the removed steps; `t_ns` itself where there are none. Rows that arrived
-        out of order stay so: sort them by `in_order`.
-
-    Raises:
-        DataError: more than 1000 steps, or steps too large for 64 bits.
-    """
-    t_ns, steps = np.asarray(t_ns), _steps(t_ns, channel, forwards, None)
-    repaired = _shifted(t_ns, steps, channel)
-    return repaired, _jumps(channel, repaired, steps)
+def repair(t_ns: TimesNs, channel: str) -> tuple[TimesNs, tuple[ClockJump, ...]]:
+    """Remove the clock steps of one channel: repaired times (N,), and the steps; see `repair_together`."""
+    fixed, jumps = repair_together({channel: np.asarray(t_ns)})
+    return fixed[channel], jumps
 
 
 def repair_together(
-    times: Mapping[str, TimesNs],
-    *,
-    forwards: bool = False,
-    beside: Mapping[str, TimesNs] | None = None,
+    times: Mapping[str, TimesNs], beside: Mapping[str, TimesNs] | None = None
 ) -> tuple[dict[str, TimesNs], tuple[ClockJump, ...]]:
     """Remove the clock steps of channels that may share a clock.
 
@@ -66,18 +49,19 @@ def repair_together(
 
     Args:
         times: (N,) int64 by channel, in the order of the rows.
-        forwards: as in `repair`.
         beside: times of the same rows on another clock of the same rate. A jump ahead of the first
-            that this one does not have is a step and no gap in the data, and is removed too.
+            that this one does not have is a step and is removed too; without it, a jump ahead cannot
+            be told from a gap in the data.
 
     Returns:
-        Repaired times by channel (the same arrays where nothing changed), and all jumps.
+        Repaired times by channel (the same arrays where nothing changed), and all jumps. Rows that
+        arrived out of order stay so: sort them by `in_order`.
 
     Raises:
-        DataError: as `repair`.
+        DataError: more than 1000 steps, or steps too large for 64 bits.
     """
     other_clock = beside or {}
-    steps = {name: _steps(t, name, forwards, other_clock.get(name)) for name, t in times.items()}
+    steps = {name: _steps(t, name, other_clock.get(name)) for name, t in times.items()}
     fixed = {name: _shifted(t, steps[name], name) for name, t in times.items()}
     fastest_first = sorted(times, key=lambda name: _period_ns(np.diff(times[name]), len(times[name]) // 2))
     for i, name in enumerate(fastest_first):
@@ -112,13 +96,12 @@ def _shifted(t_ns: TimesNs, steps: list[Step], channel: str) -> TimesNs:
     return np.asarray(t_ns + np.cumsum(lacks))
 
 
-def _steps(t_ns: TimesNs, channel: str, forwards: bool, beside: TimesNs | None) -> list[Step]:
+def _steps(t_ns: TimesNs, channel: str, beside: TimesNs | None) -> list[Step]:
     interval = np.diff(t_ns)
     suspects = np.flatnonzero(interval < 0)
-    if (forwards or beside is not None) and (interval > 0).any():
+    if beside is not None and (interval > 0).any():
         leap = max(LEAP_PERIODS * float(np.median(interval[interval > 0])), LEAP_S * 1e9)
-        ahead = interval if forwards or beside is None else interval - np.diff(beside)
-        suspects = np.union1d(suspects, np.flatnonzero(ahead > leap))
+        suspects = np.union1d(suspects, np.flatnonzero(interval - np.diff(beside) > leap))
     steps: list[Step] = []
     for row in (suspects + 1).tolist():
         period = _period_ns(interval, row)

@@ -4,17 +4,12 @@ times as long."""
 from __future__ import annotations
 
 import ctypes
-import functools
-import logging
-import subprocess
 from typing import Any
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.engine.compiler import compiled, find_compiler
-
-LOG = logging.getLogger("terrafusion.twin")
+from terrafusion.twin.engine.compiler import load
 
 _LOOP = """
 void tf_many(long n, const double **first, const long *stride, double **out, const long *size,
@@ -63,19 +58,8 @@ def pointwise(function: Any) -> Pointwise | None:
     """The compiled function, None where there is no compiler (or it fails, which is logged)."""
     import casadi as ca
 
-    compiler = find_compiler()
-    if compiler is None:
-        return None
     generator = ca.CodeGenerator("twin.c", {"with_header": False, "casadi_int": "long long"})
     generator.add(function)
     source = generator.dump() + _LOOP.format(name=function.name())
-    try:
-        return Pointwise(function, _loaded(str(compiled(source, compiler))))
-    except (OSError, subprocess.SubprocessError) as error:
-        LOG.warning("a graph could not be compiled (%s): it runs in CasADi's virtual machine", error)
-        return None
-
-
-@functools.cache
-def _loaded(path: str) -> ctypes.CDLL:
-    return ctypes.CDLL(path)
+    library = load("a graph", None, lambda: source)
+    return Pointwise(function, library) if library is not None else None

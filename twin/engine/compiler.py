@@ -5,6 +5,7 @@ Entries of the cache (`library_cache`) are named by a hash of source, flags, com
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import importlib.util
@@ -19,7 +20,7 @@ from pathlib import Path
 
 from terrafusion.datasets.core.scratch import process_folder, scratch_folder
 from terrafusion.twin.engine import library_cache
-from terrafusion.twin.engine.library_cache import cache_folder
+from terrafusion.twin.engine.library_cache import cache_folder, say
 
 LOG = logging.getLogger("terrafusion.twin")
 
@@ -40,6 +41,24 @@ def find_compiler() -> tuple[str, ...] | None:
             return (path,)
     if importlib.util.find_spec("ziglang") is not None:
         return (sys.executable, "-m", "ziglang", "cc")
+    return None
+
+
+def load(name: str, what: str | None, source: Callable[[], str]) -> ctypes.CDLL | None:
+    """The shared library of a source; None where it cannot be compiled, which is logged once.
+
+    Args:
+        name: of the source, for the log.
+        what, source: as in `remembered`.
+    """
+    command = find_compiler()
+    try:
+        if command is not None:
+            return ctypes.CDLL(str(remembered(what, source, command)))
+        say("no C compiler: the twin runs in CasADi's virtual machine, many times slower; "
+            "install a compiler or the ziglang package")  # fmt: skip
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        say(f"{name} could not be compiled ({error}): it runs in CasADi's virtual machine")
     return None
 
 

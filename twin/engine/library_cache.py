@@ -37,7 +37,7 @@ def cache_folder() -> Path:
     """The folder for compiled libraries: the wanted one if it is private, else one for this process alone."""
     folder = wanted_folder()
     if folder is None:
-        _say("there is no home folder: the twin is compiled anew for each process; set TERRAFUSION_CACHE")
+        say("there is no home folder: the twin is compiled anew for each process; set TERRAFUSION_CACHE")
         return process_folder()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ def cache_folder() -> Path:
     except OSError as error:  # a read-only or full home
         LOG.info("no cache in %s (%s)", folder, error)
         return process_folder()
-    _say(
+    say(
         f"{folder}: others can write to this folder, so no compiled code is loaded from it and the twin is "
         "compiled anew for each process; take their rights away (chmod go-w), or set TERRAFUSION_CACHE"
     )
@@ -109,5 +109,6 @@ def _write(path: Path, text: str) -> None:
 
 
 @functools.cache
-def _say(message: str) -> None:
+def say(message: str) -> None:
+    """Log a warning once."""
     LOG.warning(message)

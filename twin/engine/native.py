@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import logging
-import subprocess
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.engine import codegen, compiler
+from terrafusion.twin.engine import codegen, compiler, library_cache
 from terrafusion.twin.engine.codegen import Variant
 from terrafusion.twin.model.plant import Plant
-
-LOG = logging.getLogger("terrafusion.twin")
 
 MAX_BLOCKS = 4
 """Blocks of directions a run carries (TF_BLOCKS of tangent.c)."""
@@ -149,26 +145,12 @@ def driver(variant: Variant) -> Driver | None:
 
 @functools.cache
 def _driver(variant: Variant) -> Driver | None:
-    command = compiler.find_compiler()
-    if command is None:
-        _say("no C compiler: the twin runs in CasADi's virtual machine, many times slower; "
-             "install a compiler or the ziglang package")  # fmt: skip
-        return None
-    try:
-        what = codegen.follows_from((*variant[:-1], sorted(variant.active)), variant.effects)
-        path = compiler.remembered(what, lambda: codegen.source(variant), command)
-        return Driver(ctypes.CDLL(str(path)), variant)
-    except (OSError, ValueError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
-        _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")
-        return None
-
-
-@functools.cache
-def _say(message: str) -> None:
-    LOG.warning(message)
+    what = codegen.follows_from((*variant[:-1], sorted(variant.active)), variant.effects)
+    library = compiler.load("the twin's C code", what, lambda: codegen.source(variant))
+    return Driver(library, variant) if library is not None else None
 
 
 def forget() -> None:
     """Look for the compiler and load the drivers anew (for tests)."""
     _driver.cache_clear()
-    _say.cache_clear()
+    library_cache.say.cache_clear()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import logging
-import subprocess
 
 import numpy as np
 
@@ -13,8 +11,6 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import codegen, compiler
 from terrafusion.twin.engine.native import BUILDING
 from terrafusion.twin.physics.layout import OUTPUTS
-
-LOG = logging.getLogger("terrafusion.twin")
 
 
 class Reader:
@@ -49,16 +45,8 @@ class Reader:
 @functools.cache
 def reader(effects: tuple[str, ...], fixed_ground: bool) -> Reader | None:
     """The compiled readings, None where they cannot be compiled (which is logged)."""
-    command = compiler.find_compiler()
-    if command is None:
-        return None
-    try:
-        with BUILDING:
-            what = codegen.follows_from(("reader", fixed_ground), effects)
-            path = compiler.remembered(what, lambda: codegen.reader_source(effects, fixed_ground), command)
-        return Reader(ctypes.CDLL(str(path)))
-    except (OSError, ValueError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
-        LOG.warning(
-            "the sensors' graph could not be compiled (%s): it runs in CasADi's virtual machine", error
-        )
-        return None
+    with BUILDING:
+        what = codegen.follows_from(("reader", fixed_ground), effects)
+        source = functools.partial(codegen.reader_source, effects, fixed_ground)
+        library = compiler.load("the sensors' graph", what, source)
+    return Reader(library) if library is not None else None

@@ -98,9 +98,9 @@ def count_lines(rows: Sequence[ClaimResult]) -> list[str]:
     return lines
 
 
-def markdown_rows(rows: Sequence[ClaimResult], columns: Sequence[str] = COLUMNS) -> list[str]:
+def markdown_rows(rows: Sequence[ClaimResult]) -> list[str]:
     """The table of agreement in Markdown."""
-    return markdown_table(columns, [[str(getattr(row, column)) for column in columns] for row in rows])
+    return markdown_table(COLUMNS, [[getattr(row, column) for column in COLUMNS] for row in rows])
 
 
 def document_section(study: Study) -> list[str]:

@@ -70,6 +70,9 @@ _WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|odom|joint_s
 _GNSS_VELOCITY = re.compile(r"(fix|gps|gnss|navsat).*vel|vel.*(fix|gps|gnss|navsat)", re.IGNORECASE)
 _TERRAIN = re.compile(r"terrain|ground_class|surface", re.IGNORECASE)
 _DATUM = re.compile(r"(^|/)datum$", re.IGNORECASE)
+_NAMED = {"truth": _TRUTH, "datum": _DATUM, "terrain": _TERRAIN, "command": _COMMAND,
+          "gnss_velocity": _GNSS_VELOCITY}  # fmt: skip
+"""Channels whose topics are known by their names alone."""
 _RAW = re.compile(r"raw", re.IGNORECASE)
 _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
 
@@ -190,16 +193,8 @@ def _is_fused(kind: str, topic: BagTopic) -> bool:
 
 def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool:
     name = topic.name
-    if kind == "truth":
-        return bool(_TRUTH.search(name))
-    if kind == "datum":
-        return bool(_DATUM.search(name))
-    if kind == "terrain":
-        return bool(_TERRAIN.search(name))
-    if kind == "command":
-        return bool(_COMMAND.search(name))
-    if kind == "gnss_velocity":
-        return bool(_GNSS_VELOCITY.search(name))
+    if kind in _NAMED:
+        return bool(_NAMED[kind].search(name))
     if kind in ("imu", "barometer", "magnetometer"):
         return True
     if _TRUTH.search(name) or _is_fused(kind, topic):

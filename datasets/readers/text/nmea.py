@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -61,9 +62,9 @@ def read(request: Request) -> list[Recording]:
 
 def _dated(path: Path, epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
     """Unix nanoseconds of the epochs: and notes on the source of their date."""
-    day = epochs.day
-    if np.isfinite(epochs.date).any():
-        first_days = epochs.date - day  # the date of the log's first day, as each dated epoch has it
+    day, date = epochs.column("day"), epochs.column("date")
+    if np.isfinite(date).any():
+        first_days = date - day  # the date of the log's first day, as each dated epoch has it
         known = np.flatnonzero(np.isfinite(first_days))
         nearest = known[np.clip(np.searchsorted(known, np.arange(len(day)), side="right") - 1, 0, None)]
         first, notes = first_days[nearest], _date_notes(first_days[known])
@@ -77,13 +78,13 @@ def _dated(path: Path, epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]
             )
         elif abs(off) > 1.0:
             notes.append(f"gnss: dates are {off:.0f} days off the log's own time stamps; not corrected")
-    elif np.isfinite(epochs.receipt_s).any():
+    elif np.isfinite(epochs.column("receipt_s")).any():
         first = np.full(len(day), _receipt_days(epochs))
         notes = ["gnss: no sentence has a date; that of the log's own time stamps is taken"]
     else:
         first = np.zeros(len(day))
         notes = ["gnss: no sentence has a date: times are those of day 0, 1970-01-01"]
-    return (day + first).astype(np.int64) * DAY_NS + epochs.of_day_ns, notes
+    return (day + first).astype(np.int64) * DAY_NS + epochs.column("of_day_ns"), notes
 
 
 def _date_notes(first_days: Array) -> list[str]:
@@ -93,25 +94,26 @@ def _date_notes(first_days: Array) -> list[str]:
 
 def _receipt_days(epochs: NmeaEpochs) -> float:
     """Date of the log's first day by the time stamps in front of the sentences, days since 1970."""
-    stamped = np.flatnonzero(np.isfinite(epochs.receipt_s))
-    if not stamped.size:
-        return float("nan")
-    i = int(stamped[0])
-    return float(np.rint((epochs.receipt_s[i] - epochs.of_day_ns[i] * 1e-9) / 86400.0) - epochs.day[i])
+    first = next((epoch for epoch in epochs.epochs if math.isfinite(epoch.receipt_s)), None)
+    if first is None:
+        return math.nan
+    return float(np.rint((first.receipt_s - first.of_day_ns * 1e-9) / 86400.0) - first.day)
 
 
 def _fixes(request: Request, epochs: NmeaEpochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
     """The fixes, with HDOP for the sigmas that no GST gives."""
     notes = []
-    fix, sigma = epochs.fix, epochs.sigma_enu_m.copy()
+    fix, hdop = epochs.column("fix").astype(np.uint8), epochs.column("hdop")
+    sigma = epochs.column("sigma_enu_m")
     spec = request.rig.sensors.gnss if request.rig else None
     at_one = np.array([spec.sigma_horizontal_m if spec else ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])
-    counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (epochs.hdop < UNKNOWN_HDOP)
+    counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (hdop < UNKNOWN_HDOP)
     if counted.any():
-        flat = (epochs.hdop * at_one[fix])[counted]
+        flat = (hdop * at_one[fix])[counted]
         sigma[counted] = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
         used = ", ".join(f"{Fix(k).name.lower()} {at_one[k]:g} m" for k in np.unique(fix[counted]))
         notes.append(f"gnss: {int(counted.sum())} fixes without GST: sigma is HDOP times an assumed {used}")
     if epochs.left_out:
         notes.append(f"gnss: {epochs.left_out} estimated, manual or simulated positions left out")
-    return Fixes(t_ns, epochs.llh, fix, sigma, epochs.velocity_enu_mps), notes
+    velocity = epochs.column("velocity_enu_mps")
+    return Fixes(t_ns, epochs.column("llh"), fix, sigma, velocity), notes

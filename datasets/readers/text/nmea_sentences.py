@@ -10,11 +10,11 @@ from datetime import UTC, date, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 
@@ -53,48 +53,51 @@ class _NoTimeError(Exception):
 
 
 @dataclass
-class _Epoch:
-    """One epoch: nanoseconds of the day, days since the log's first, and its data."""
+class Epoch:
+    """One epoch; NaN where unknown.
+
+    Attributes:
+        of_day_ns: nanoseconds of the day.
+        day: midnights since the log's first epoch.
+        receipt_s: Unix time in front of the sentence.
+        date: days since 1970 where a sentence gives it.
+        llh: latitude deg, longitude deg, height m; None where no sentence has a position.
+        fix: a `Fix` value.
+        sigma_enu_m, velocity_enu_mps: east, north, up.
+        from_gga: whether a GGA gave the position.
+    """
 
     of_day_ns: int
     day: int
     receipt_s: float = np.nan
     date: float = np.nan
-    position: tuple[float, float, float] | None = None
-    fix: int | None = None
+    llh: tuple[float, float, float] | None = None
+    fix: int = Fix.NONE
     hdop: float = np.nan
-    sigma: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    velocity: tuple[float, float] = (np.nan, np.nan)
+    sigma_enu_m: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    velocity_enu_mps: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     from_gga: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class NmeaEpochs:
-    """The epochs with a position, as arrays (N,) or (N, 3); NaN where unknown.
+    """The epochs with a position, and how many positions are no fixes but estimated or typed in."""
 
-    `day` counts midnights since the log's first epoch, `date` is days since 1970 where a sentence
-    gives it, `receipt_s` the Unix time in front of the sentence.
-    """
-
-    of_day_ns: NDArray[np.int64]
-    day: Array
-    date: Array
-    receipt_s: Array
-    llh: Array
-    fix: NDArray[np.uint8]
-    hdop: Array
-    sigma_enu_m: Array
-    velocity_enu_mps: Array
+    epochs: list[Epoch]
     left_out: int
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A field of all epochs, (N,) or (N, 3)."""
+        return np.array([getattr(epoch, name) for epoch in self.epochs])
 
 
 @dataclass
 class _Log:
-    epochs: list[_Epoch] = field(default_factory=list)
+    epochs: list[Epoch] = field(default_factory=list)
     day: int = 0
     left_out: int = 0
 
-    def at(self, text: str) -> _Epoch:
+    def at(self, text: str) -> Epoch:
         """The epoch of a time of day: one of the newest, or a new one."""
         of_day = _time_of_day(text)
         same = next((e for e in reversed(self.epochs[-NEAR_EPOCHS:]) if e.of_day_ns == of_day), None)
@@ -105,7 +108,7 @@ class _Log:
             self.day += 1
         elif last is not None and self.day and of_day > last.of_day_ns + DAY_NS // 2:
             self.day -= 1  # a late sentence of before midnight
-        self.epochs.append(_Epoch(of_day, self.day))
+        self.epochs.append(Epoch(of_day, self.day))
         return self.epochs[-1]
 
 
@@ -147,31 +150,18 @@ def collect(path: Path, text: str) -> tuple[NmeaEpochs, list[str]]:
         notes.append(f"gnss: {timeless} sentences of a receiver without time yet; left out")
     if unchecked:
         notes.append(f"gnss: {unchecked} sentences have no checksum; taken as they are")
-    return _arrays(path, log), notes
+    return _with_position(path, log), notes
 
 
-def _arrays(path: Path, log: _Log) -> NmeaEpochs:
-    epochs = [epoch for epoch in log.epochs if epoch.position is not None]
+def _with_position(path: Path, log: _Log) -> NmeaEpochs:
+    epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", file=path, remedy="record GGA or RMC")
-    if any(epoch.from_gga for epoch in epochs):  # RMC repeats the position with fewer digits
-        epochs = [epoch for epoch in epochs if epoch.from_gga]
-    velocity = np.array([(*epoch.velocity, np.nan) for epoch in epochs])
-    return NmeaEpochs(
-        np.array([epoch.of_day_ns for epoch in epochs], dtype=np.int64),
-        np.array([epoch.day for epoch in epochs], dtype=float),
-        np.array([epoch.date for epoch in epochs]),
-        np.array([epoch.receipt_s for epoch in epochs]),
-        np.array([epoch.position for epoch in epochs], dtype=float),
-        np.array([epoch.fix or 0 for epoch in epochs], dtype=np.uint8),
-        np.array([epoch.hdop for epoch in epochs]),
-        np.array([epoch.sigma for epoch in epochs]),
-        velocity,
-        log.left_out,
-    )
+    # RMC repeats the position of a GGA with fewer digits
+    return NmeaEpochs([epoch for epoch in epochs if epoch.from_gga] or epochs, log.left_out)
 
 
-def _gga(log: _Log, f: list[str]) -> _Epoch:
+def _gga(log: _Log, f: list[str]) -> Epoch:
     quality = int(f[5] or 0)
     if quality not in FIX_OF_QUALITY and quality not in NO_FIX:
         raise ValueError(quality)
@@ -184,36 +174,36 @@ def _gga(log: _Log, f: list[str]) -> _Epoch:
     if epoch.from_gga:
         return epoch  # a second talker repeats the epoch
     log.left_out += quality in NO_FIX
-    epoch.position, epoch.hdop, epoch.from_gga = position, hdop, True
+    epoch.llh, epoch.hdop, epoch.from_gga = position, hdop, True
     epoch.fix = FIX_OF_QUALITY.get(quality, Fix.NONE)
     return epoch
 
 
-def _rmc(log: _Log, f: list[str]) -> _Epoch:
+def _rmc(log: _Log, f: list[str]) -> Epoch:
     valid = f[1] == "A"
     position = (np.nan, np.nan, np.nan)
     if valid:
         position = (_angle(f[2], f[3], "NS"), _angle(f[4], f[5], "EW"), np.nan)
-    velocity = _velocity(f[6], f[7]) if valid else (np.nan, np.nan)
+    velocity = _velocity(f[6], f[7]) if valid else (np.nan, np.nan, np.nan)
     day = _date(int(f[8][4:6]), f[8][2:4], f[8][:2]) if f[8] else np.nan
     mode = f[11] if len(f) > 11 else ""
     epoch = log.at(f[0])
     if math.isnan(epoch.date):
         epoch.date = day
-    epoch.velocity = velocity
-    if epoch.position is None:
-        epoch.position, epoch.fix = position, FIX_OF_MODE.get(mode, Fix.NONE) if valid else Fix.NONE
+    epoch.velocity_enu_mps = velocity
+    if epoch.llh is None:
+        epoch.llh, epoch.fix = position, FIX_OF_MODE.get(mode, Fix.NONE) if valid else Fix.NONE
     return epoch
 
 
-def _gst(log: _Log, f: list[str]) -> _Epoch:
+def _gst(log: _Log, f: list[str]) -> Epoch:
     north, east, up = (_float(word) for word in f[5:8])
     epoch = log.at(f[0])
-    epoch.sigma = (east, north, up)
+    epoch.sigma_enu_m = (east, north, up)
     return epoch
 
 
-def _zda(log: _Log, f: list[str]) -> _Epoch:
+def _zda(log: _Log, f: list[str]) -> Epoch:
     if f[3] and not 1980 <= int(f[3]) < CENTURIES_END:  # GPS begins in 1980, 64 bits of ns end in 2262
         raise ValueError(f[3])
     day = _date(int(f[3]), f[2], f[1]) if f[3] else np.nan
@@ -225,11 +215,11 @@ def _zda(log: _Log, f: list[str]) -> _Epoch:
 def _vtg(log: _Log, f: list[str]) -> None:
     """Course and speed of the epoch before it, where no RMC has them."""
     velocity = _velocity(f[4], f[0])
-    if log.epochs and np.isnan(log.epochs[-1].velocity[0]):
-        log.epochs[-1].velocity = velocity
+    if log.epochs and np.isnan(log.epochs[-1].velocity_enu_mps[0]):
+        log.epochs[-1].velocity_enu_mps = velocity
 
 
-_PARSERS: dict[str, Callable[[_Log, list[str]], _Epoch | None]] = {
+_PARSERS: dict[str, Callable[[_Log, list[str]], Epoch | None]] = {
     "GGA": _gga, "RMC": _rmc, "GST": _gst, "ZDA": _zda, "VTG": _vtg,
 }  # fmt: skip
 
@@ -273,13 +263,13 @@ def _angle(text: str, side: str, sides: str) -> float:
     return -angle if side == sides[1] else angle
 
 
-def _velocity(knots: str, course: str) -> tuple[float, float]:
-    """East and north, m/s; a receiver at rest gives no course."""
+def _velocity(knots: str, course: str) -> tuple[float, float, float]:
+    """East and north, m/s, and an unknown up; a receiver at rest gives no course."""
     speed = _float(knots) * KNOT_MPS
     if speed == 0.0:
-        return 0.0, 0.0
+        return 0.0, 0.0, math.nan
     heading = math.radians(_float(course))
-    return speed * math.sin(heading), speed * math.cos(heading)
+    return speed * math.sin(heading), speed * math.cos(heading), math.nan
 
 
 def _date(year: int, month: str, day: str) -> float:

@@ -31,7 +31,7 @@ def stepped(t_ns: np.ndarray, *steps: tuple[int, float]) -> np.ndarray:
 
 def test_a_good_clock_is_left_alone() -> None:
     t = ticks(jitter=0.4)
-    repaired, jumps = repair(t, "imu", forwards=True)
+    repaired, jumps = repair(t, "imu")
     assert repaired is t
     assert jumps == ()
     assert in_order(t) is None
@@ -43,7 +43,7 @@ def test_a_good_clock_is_left_alone() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_short_channels(n: int) -> None:
     t = ticks(n)
-    assert repair(t, "imu", forwards=True) == (t, ())
+    assert repair(t, "imu") == (t, ())
 
 
 @settings(max_examples=200, deadline=None)
@@ -76,14 +76,14 @@ def test_steps_of_an_even_clock_are_taken_out_exactly() -> None:
     )
 
 
-def test_leaps_ahead_only_where_asked() -> None:
+def test_leaps_ahead_only_beside_a_clock_without_them() -> None:
     t = ticks()
     leapt = stepped(t, (400, 3600.0), (700, -3600.0))
     kept, jumps = repair(stepped(t, (400, 3600.0)), "imu")
     assert jumps == ()
     assert kept[-1] - t[-1] == 3600 * S
-    repaired, jumps = repair(leapt, "imu", forwards=True)
-    np.testing.assert_array_equal(repaired, t)
+    repaired, jumps = repair_together({"imu": leapt}, beside={"imu": t})
+    np.testing.assert_array_equal(repaired["imu"], t)
     assert [jump.step_s for jump in jumps] == [3600.0, -3600.0]
 
 

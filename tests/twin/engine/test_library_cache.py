@@ -63,7 +63,7 @@ def test_a_folder_others_can_write_to_is_not_used(
     path = built(cache, monkeypatch)
     path.write_bytes(b"of somebody else")
     cache.chmod(mode)
-    library_cache._say.cache_clear()
+    library_cache.say.cache_clear()
     with caplog.at_level(logging.WARNING):
         other = built(cache, monkeypatch)
     assert other.parent != cache
