@@ -71,13 +71,14 @@ class DriftWatch:
         """
         self.seen = [one for one in self.seen if 0 < t_ns - one[0] <= WINDOW_S * 1e9]
         found = None
+        east_m, north_m = drift_m.tolist()
         for before_ns, before_m, before_m2 in self.seen:
             kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
             new_m2 = self.sigma_m**2 * (1.0 - kept**2)
-            moved_m = drift_m - kept * before_m
             allowed_m2 = max(kept**2 * before_m2 + new_m2 - variance_m2, new_m2)
-            if float(moved_m @ moved_m) > LIMIT * allowed_m2:
-                found = before_ns, moved_m
+            e_m, n_m = before_m.tolist()
+            if (east_m - kept * e_m) ** 2 + (north_m - kept * n_m) ** 2 > LIMIT * allowed_m2:
+                found = before_ns, drift_m - kept * before_m
                 break
         self.seen.append((t_ns, drift_m, variance_m2))
         return found

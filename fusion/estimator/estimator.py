@@ -266,8 +266,9 @@ class Estimator:
             return False
         if last or self.wheels.covers(t_ns):
             return True
-        wait_s = max(self.config.wheel_wait_s, 1.5 * usual_interval_s(self.wheels.t_ns))
-        return self.imu.covers(t_ns + round(wait_s * 1e9))
+        if not self.imu.covers(t_ns + round(self.config.wheel_wait_s * 1e9)):
+            return False
+        return self.imu.covers(t_ns + round(1.5e9 * usual_interval_s(self.wheels.t_ns)))
 
     def _begin(self, start: Start) -> None:
         slowest_s = max(usual_interval_s(self.imu.t_ns), usual_interval_s(self.wheels.t_ns))

@@ -203,11 +203,15 @@ class Chain:
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
         while len(self.nodes) > keep and self._dirty > self.first:
-            if self.first < self._inserted:
-                for symbol, _ in SYMBOLS.values():
-                    self.values.erase(symbol(self.first))
+            self._erase(self.first, self.first + 1)
             self.nodes.pop(0)
             self.first += 1
+
+    def _erase(self, begin: int, end: int) -> None:
+        """Erase the variables of GTSAM of the keyframes `begin` to `end - 1`."""
+        for k in range(begin, min(end, self._inserted)):
+            for symbol, _ in SYMBOLS.values():
+                self.values.erase(symbol(k))
 
     def restart(self, extra_variance: Array, k: int | None = None, anew: Sequence[int] = ()) -> None:
         """Drop all before keyframe k (by default the newest); its marginal stays as prior, with
@@ -230,9 +234,10 @@ class Chain:
         point, empty = node.point.retract(shift), gtsam.NonlinearFactorGraph()
         fresh = self._node(point, node.t_ns, empty, None, None, node.gyro_radps, node.accel_mps2, False)
         fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
+        self._erase(self.first, k)
         self.nodes, self.first, self._dirty = [fresh, *self.nodes[k - self.first + 1 :]], k, k
         self._anchor = None
-        self.rebuild()
+        self._publish(k)
         self._eliminate_all()
 
     def turn(self, yaw_rad: float, from_m: Array, to_m: Array) -> None:

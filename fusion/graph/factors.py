@@ -126,7 +126,7 @@ def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: float) -> gtsam.Nonlin
 def mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     """Mean angular rate (3,) and specific force (3,) over the segments."""
     dt_s = np.array([s.dt_s for s in segments])[:, None]
-    readings = np.array([(s.gyro_radps, s.accel_mps2) for s in segments]).reshape(-1, 6)
+    readings = np.concatenate([a for s in segments for a in (s.gyro_radps, s.accel_mps2)]).reshape(-1, 6)
     mean = (readings * dt_s).sum(axis=0) / sum(s.dt_s for s in segments)
     return mean[:3], mean[3:]
 

@@ -32,12 +32,14 @@ from terrafusion.fusion.inputs.door import (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ImuSegment:
-    """A time (s) of constant angular rate (3,) and specific force (3,).
+    """A time (s) of constant angular rate (3,) and specific force (3,), never changed.
 
     `gyro_held`, `accel_held`: earlier samples replace a spike. A modelled force has its density on x, y.
     """
+
+    # Not frozen: dozens are made for each keyframe, and frozen ones take three times as long.
 
     dt_s: float
     gyro_radps: Array
@@ -229,11 +231,14 @@ class ImuStream:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
         i = bisect.bisect_right(self.t_ns, start_ns)
         segments, t = [], start_ns
+        corrected = not self.six_axis or self.turn_scale != 0.0 or self.mounting_rad != 0.0
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
                 held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
-                readings = self._for_graph(self.gyro[i], self.accel[i])
+                readings = self.gyro[i], self.accel[i]
+                if corrected:
+                    readings = self._for_graph(*readings)
                 segments.append(ImuSegment((until - t) * 1e-9, *readings, *held))
             t = until
             i += 1
