@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, counted, period_s, retimed
+from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, counted, period_s, retiming
 from terrafusion.datasets.checks.motion import Signal
 from terrafusion.datasets.checks.sensor_pairs import LEAST_R, Pair, SensorPairs, near_lag, reason
 from terrafusion.datasets.core.arrays import TimesNs
@@ -84,21 +85,21 @@ def jump_findings(context: CheckContext, jumps: dict[str, list[JumpAhead]]) -> I
     for name, own in jumps.items():
         at_s = context.since_start_s(clocks_of(context.recording)[name][own[0].row])
         total_s = sum(jump.step_ns for jump in own) * 1e-9
-
-        def repair(recording: Recording, name: str = name, own: list[JumpAhead] = own) -> Recording:
-            t_ns = getattr(recording, name).t_ns.copy()
-            for jump in own:
-                t_ns[jump.row :] -= jump.step_ns
-            return retimed(recording, name, t_ns)
-
         yield Finding(
             "clock-jump", "error", name,
             f"its clock jumps ahead {counted(len(own), 'time')}",
             f"by {total_s:.2f} s in all, first at t = {at_s:.2f} s; the other channels continue meanwhile, "
             "and the samples after it fit them only when moved back",
             "move the samples after it back",
-            repair,
+            retiming(name, functools.partial(_moved_back, own)),
         )  # fmt: skip
+
+
+def _moved_back(jumps: list[JumpAhead], t_ns: TimesNs) -> TimesNs:
+    moved = t_ns.copy()
+    for jump in jumps:
+        moved[jump.row :] -= jump.step_ns
+    return moved
 
 
 def _candidates(t_ns: TimesNs) -> list[JumpAhead]:
@@ -211,15 +212,11 @@ def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
     drift = drifts[pair] if name == pair[1] else drifts[pair].reversed()
     scaled = dataclasses.replace(drift, offset_s=0.0)  # an offset is a later finding
     rate, against = 1.0 / drift.scale - 1.0, pair[0] if name == pair[1] else pair[1]
-
-    def repair(recording: Recording) -> Recording:
-        return retimed(recording, name, scaled.corrected(getattr(recording, name).t_ns))
-
     return Finding(
         "clock-drift", "error", name,
         f"its clock runs {abs(rate):.2%} too {'fast' if rate > 0 else 'slow'}",
         f"{rate:+.3%} +- {drift.spread:.3%} against {against} by the lags at both ends of the log "
         f"(correlation {drift.r:.2f}); their durations differ by the same rate",
         f"scale the times of {name} about its first; {reason(name, set(drifts))}",
-        repair,
+        retiming(name, scaled.corrected),
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
-from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed
+from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed, retiming
 from terrafusion.datasets.checks.motion import Signal
 from terrafusion.datasets.checks.path import path_by
 from terrafusion.datasets.checks.path_model import path_model
@@ -96,19 +96,13 @@ def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SURELY_LATE_S):
         return
     late = model.delay_s
-    shift_ns = round(late.value * 1e9)
-
-    def repair(recording: Recording) -> Recording:
-        assert recording.gnss is not None
-        return retimed(recording, "gnss", recording.gnss.t_ns - shift_ns)
-
     yield Finding(
         "clock-offset", "warning", "gnss",
         f"its times are {abs(late.value):.2f} s {'late' if late.value > 0 else 'early'} "
         "against wheels and imu",
         f"95 % interval {late.low:.2f} to {late.high:.2f} s, by the path in {model.windows} stretches",
         f"move the times of gnss by {-late.value:+.2f} s",
-        repair,
+        retiming("gnss", lambda t_ns: t_ns - round(late.value * 1e9)),
     )  # fmt: skip
 
 
@@ -120,10 +114,6 @@ def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pai
     if name == pair[0]:
         lag = Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
     ahead = name if lag.seconds < 0.0 else against
-
-    def repair(recording: Recording) -> Recording:
-        return retimed(recording, name, getattr(recording, name).t_ns - round(lag.seconds * 1e9))
-
     surely = CALIBRATED_S if name == "gnss" else SLIDING_S if ahead == "wheels" else SURELY_S
     return Finding(
         "clock-offset",
@@ -132,7 +122,7 @@ def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pai
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",
         f"move the times of {name} by {-lag.seconds:+.3f} s; {reason(name, set(off))}",
-        repair,
+        retiming(name, lambda t_ns: t_ns - round(lag.seconds * 1e9)),
     )
 
 

@@ -6,7 +6,13 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, scaled, with_fields, without_rows
+from terrafusion.datasets.checks.finding import (
+    CheckContext,
+    Finding,
+    changed_field,
+    scaled,
+    without_rows,
+)
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 
@@ -107,19 +113,13 @@ def _hard_iron(field: Array) -> Iterator[Finding]:
     if offset <= HARD_IRON * radius:
         return
     worst = np.degrees(np.arcsin(min(offset / radius, 1.0)))
-
-    def repair(recording: Recording) -> Recording:
-        assert recording.magnetometer is not None
-        field_t = recording.magnetometer.field_t - np.append(centre, 0.0)
-        return with_fields(recording, "magnetometer", field_t=field_t)
-
     yield Finding(
         "hard-iron", "warning", "magnetometer",
         f"the robot's own iron turns the compass by up to {worst:.0f} deg",
         f"over the turns of the run the horizontal field circles ({centre[0] * 1e6:.1f}, "
         f"{centre[1] * 1e6:.1f}) uT at a radius of {radius * 1e6:.1f} uT",
         "subtract that offset, assuming level ground",
-        repair,
+        changed_field("magnetometer", "field_t", lambda field_t: field_t - np.append(centre, 0.0)),
     )  # fmt: skip
 
 

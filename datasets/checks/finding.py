@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import TimesNs
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -79,21 +79,32 @@ def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:
     return dataclasses.replace(recording, **{channel: changed})
 
 
+def changed(part: str, change: Callable[[Any], Any]) -> Repair:
+    """A repair that replaces a channel, or another field of a recording, by what `change` makes of it."""
+    return lambda recording: dataclasses.replace(recording, **{part: change(getattr(recording, part))})
+
+
+def changed_field(channel: str, field: str, change: Callable[[Array], Array]) -> Repair:
+    """A repair that replaces a field of a channel by what `change` makes of it."""
+    return changed(channel, lambda old: dataclasses.replace(old, **{field: change(getattr(old, field))}))
+
+
 def scaled(channel: str, factor: float, *fields: str) -> Repair:
     """A repair that multiplies fields of a channel."""
-
-    def repair(recording: Recording) -> Recording:
-        part = getattr(recording, channel)
-        return with_fields(recording, channel, **{name: getattr(part, name) * factor for name in fields})
-
-    return repair
+    return changed(
+        channel,
+        lambda old: dataclasses.replace(old, **{name: getattr(old, name) * factor for name in fields}),
+    )
 
 
 def without_rows(channel: str, rows: NDArray[np.bool_]) -> Repair:
     """A repair that drops the rows of a mask."""
-    return lambda recording: dataclasses.replace(
-        recording, **{channel: getattr(recording, channel).select(~rows)}
-    )
+    return changed(channel, lambda old: old.select(~rows))
+
+
+def retiming(channel: str, change: Callable[[TimesNs], TimesNs]) -> Repair:
+    """A repair that gives a channel (or "truth") the times that `change` makes of its own."""
+    return lambda recording: retimed(recording, channel, change(getattr(recording, channel).t_ns))
 
 
 def retimed(recording: Recording, name: str, t_ns: TimesNs) -> Recording:

@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed_field
 from terrafusion.datasets.checks.motion import common_span, yaw_angles
 from terrafusion.datasets.checks.path import path_by
 from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.core.bootstrap import resampled_rows
-from terrafusion.datasets.core.recording import Recording
 
 WINDOW_S, LEAST_WINDOWS, LEAST_R = 4.0, 12, 0.95
 """Yaw rates are compared as means over windows so long that a delay hardly matters."""
@@ -37,18 +36,13 @@ def check_gyro_scale(context: CheckContext) -> Iterator[Finding]:
     if not LARGE < abs(error.value) < MOST or not error.is_beyond(SURELY) or error.high - error.low > WIDEST:
         return
     factor = 1.0 / (1.0 + error.value)
-
-    def repair(recording: Recording) -> Recording:
-        assert recording.imu is not None
-        return with_fields(recording, "imu", gyro_radps=recording.imu.gyro_radps * (1.0, 1.0, factor))
-
     yield Finding(
         "gyro-scale", "warning", "imu",
         f"gyro z reads {abs(error.value):.1%} too {'much' if error.value > 0.0 else 'little'}",
         f"{1.0 + error.value:.4f} times the turns by {source}, 95 % interval {1.0 + error.low:.4f} to "
         f"{1.0 + error.high:.4f}",
         f"multiply gyro z by {factor:.4f}",
-        repair,
+        changed_field("imu", "gyro_radps", lambda rates: rates * (1.0, 1.0, factor)),
     )  # fmt: skip
 
 

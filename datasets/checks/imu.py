@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled, with_fields
+from terrafusion.datasets.checks.finding import (
+    CheckContext,
+    Finding,
+    Repair,
+    changed_field,
+    scaled,
+    with_fields,
+)
 from terrafusion.datasets.checks.motion import (
     Integral,
     agreement,
@@ -127,17 +134,12 @@ def check_bias(context: CheckContext) -> Iterator[Finding]:
     largest = float(np.abs(bias).max())
     if largest <= LARGE_BIAS_RADPS:
         return
-
-    def repair(recording: Recording) -> Recording:
-        assert recording.imu is not None
-        return with_fields(recording, "imu", gyro_radps=recording.imu.gyro_radps - bias)
-
     yield Finding(
         "gyro-bias", "error" if largest > IMPOSSIBLE_BIAS_RADPS else "warning", "imu",
         f"the gyro turns {what} by up to {np.degrees(largest):.1f} deg/s",
         f"mean ({', '.join(f'{value:.3f}' for value in bias)}) rad/s {where}",
         "subtract these means",
-        repair,
+        changed_field("imu", "gyro_radps", lambda rates: rates - bias),
     )  # fmt: skip
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, with_fields
 from terrafusion.datasets.checks.imu import at_rest
 from terrafusion.datasets.checks.motion import (
     Integral,
@@ -44,17 +43,12 @@ def check_apart(context: CheckContext) -> Iterator[Finding]:
     if wheels is None or not sampled_apart(wheels):
         return
     whole = np.asarray(np.isfinite(wheels.speed).all(axis=1))
-
-    def repair(recording: Recording) -> Recording:
-        assert recording.wheels is not None
-        return dataclasses.replace(recording, wheels=paired_sides(recording.wheels))
-
     yield Finding(
         "sides-apart", "error", "wheels",
         "left and right are sampled at different times",
         f"{int(whole.sum())} of {len(whole)} rows have both",
         "interpolate each side between its own samples",
-        repair,
+        changed("wheels", paired_sides),
     )  # fmt: skip
 
 

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields, without_rows
+from terrafusion.datasets.checks.finding import (
+    CheckContext,
+    Finding,
+    Repair,
+    changed,
+    with_fields,
+    without_rows,
+)
 from terrafusion.datasets.checks.motion import ANY_RADIUS_M, runs, yaw_rates
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel, Imu, Wheels
@@ -70,20 +78,18 @@ def check_held(context: CheckContext) -> Iterator[Finding]:
         rows = held_rows(values)
         if share <= HELD_SHARE or rows == 1:  # runs of varying length are those of a coarse signal
             continue
-
-        def repair(recording: Recording, name: str = name, rows: int = rows) -> Recording:
-            channel = getattr(recording, name)
-            updates = true_updates(_measured(channel), rows)
-            return dataclasses.replace(recording, **{name: channel.select(updates)})
-
         yield Finding(
             "held-values", "warning", name,
             "values are held",
             f"{share:.0%} of the samples repeat the one before while the signal changes; "
             f"a new value comes every {run:.1f} samples",
             f"keep the true updates: the first row of each run, and every {rows} rows where nothing changes",
-            repair,
+            changed(name, functools.partial(_true_rows, rows)),
         )  # fmt: skip
+
+
+def _true_rows(rows: int, channel: Channel) -> Channel:
+    return channel.select(true_updates(_measured(channel), rows))
 
 
 def _measured(channel: Channel) -> Array:

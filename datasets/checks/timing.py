@@ -13,10 +13,12 @@ from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
     Repair,
+    changed,
     clocks_of,
     counted,
     period_s,
     retimed,
+    retiming,
 )
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Channel
@@ -173,10 +175,6 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
         mean = float(dt.mean())
         late = (channel.t_ns - _even(channel.t_ns, GAP_S)) * 1e-9
         regular = len(dt) >= 50 and late.std() < mean and np.abs(late).max() < GAP_PERIODS * mean
-
-        def repair(recording: Recording, name: str = name) -> Recording:
-            return retimed(recording, name, _even(getattr(recording, name).t_ns, GAP_S))
-
         yield Finding(
             "uneven-sampling", "warning", name,
             "uneven sampling",
@@ -184,7 +182,7 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
             "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
             if regular
             else "use the sensor's own time stamps; the log does not have them",
-            repair if regular else None,
+            retiming(name, lambda t_ns: _even(t_ns, GAP_S)) if regular else None,
         )  # fmt: skip
 
 
@@ -227,18 +225,12 @@ def check_duplicates(context: CheckContext) -> Iterator[Finding]:
         repeated = np.flatnonzero(np.diff(channel.t_ns) == 0)
         if not repeated.size or (name in CLOCKED and coarse_tick_s(channel)):
             continue
-
-        def repair(recording: Recording, name: str = name) -> Recording:
-            channel = getattr(recording, name)
-            first = np.diff(channel.t_ns, prepend=channel.t_ns[0] - 1) > 0
-            return dataclasses.replace(recording, **{name: channel.select(first)})
-
         yield Finding(
             "repeated-times", "warning", name,
             f"{repeated.size} repeated times",
             f"first at t = {context.since_start_s(channel.t_ns[repeated[0]]):.3f} s",
             "keep the first sample of each time",
-            repair,
+            changed(name, lambda own: own.select(np.diff(own.t_ns, prepend=own.t_ns[0] - 1) > 0)),
         )  # fmt: skip
 
 

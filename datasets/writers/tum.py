@@ -1,4 +1,4 @@
-"""TUM trajectory files (`read_tum` is in `readers.text.tum`)."""
+"""TUM trajectory files (read by `readers.text.tum`)."""
 
 from __future__ import annotations
 

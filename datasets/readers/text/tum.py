@@ -70,19 +70,6 @@ def read(request: Request) -> list[Recording]:
     return [recording]
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory; lines that start with # are comments.
-
-    Raises:
-        DataError: missing file, a line that is not eight finite numbers, or time not increasing.
-    """
-    t_ns, table, _ = tum_rows(path)
-    try:
-        return Trajectory(t_ns, table[:, :3], table[:, 3:])
-    except DataError as error:
-        raise DataError(error.what, file=path, time_s=error.time_s, remedy=error.remedy) from None
-
-
 def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
     """Times (N,) int64 ns, positions and quaternions (N, 7) as the file has them, and notes.
 

@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
-from terrafusion.datasets.readers.text.tum import read_tum
+from terrafusion.datasets.readers import open_recording
 from terrafusion.fusion.metrics.scores import HeldOut, Outage, Scores, score
 from terrafusion.fusion.outputs.replay_files import (
     MODES,
@@ -152,7 +152,8 @@ def test_all_files_are_written_and_read_back(drive, tmp_path):
     assert rows[0]["status"] == "running"
     assert float(rows[0]["w_gyro_inflation"]) == pytest.approx(2.0, abs=1e-3)
 
-    back = read_tum(paths["trajectory.tum"])
+    back = open_recording(paths["trajectory.tum"]).truth
+    assert back is not None
     np.testing.assert_array_equal(back.t_ns, estimate.trajectory.t_ns)
     changes = [json.loads(line) for line in paths["weights.jsonl"].read_text(encoding="utf-8").splitlines()]
     assert [c["sensor"] for c in changes] == ["wheels", "imu"]
