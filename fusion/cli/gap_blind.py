@@ -35,8 +35,15 @@ def gap_blind(
     share: Annotated[
         float, typer.Option(min=0.01, max=1.0, help="Of the trials of every family in the full check.")
     ] = 1.0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that diagnose.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Trials that are diagnosed at once.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
+    backend: Annotated[str, typer.Option(help="loky: this machine; dask: a cluster.")] = "loky",
+    address: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="The Dask cluster's scheduler.")
+    ] = None,
+    opponent: Annotated[
+        bool, typer.Option("--opponent/--no-opponent", help="Joint least squares on the same trials.")
+    ] = True,
 ) -> Result:
     """Judge the gap diagnosis on trials whose truth is sealed until all answers are given.
 
@@ -48,25 +55,34 @@ def gap_blind(
       terrafusion gap-blind --quick --out blind
 
       terrafusion gap-blind --share 0.2 --jobs 2 --out blind
+
+      terrafusion gap-blind --backend dask --address tcp://10.0.0.5:8786 --jobs 16 --out blind
     """
     from terrafusion.fusion.reports.blind import summary, write_blind
     from terrafusion.twin.gap import diagnose
+    from terrafusion.twin.gap.blind.answers import Pool
     from terrafusion.twin.gap.blind.check import run_blind_check
-    from terrafusion.twin.gap.blind.plan import FULL
+    from terrafusion.twin.gap.blind.opponent import joint_least_squares
+    from terrafusion.twin.gap.blind.plan import FULL, QUICK
 
     if quick and share < 1.0:
         raise typer.BadParameter("a quick check has its own size", param_hint="--share")
-    judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
+    if backend not in ("loky", "dask"):
+        raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
+    if (address is not None) != (backend == "dask"):
+        raise typer.BadParameter("goes with --backend dask, which needs it", param_hint="--address")
+    # Processes, or threads inside.
+    judged = partial(diagnose, jobs=1) if jobs > 1 or backend == "dask" else diagnose
     with progress_bar("diagnosing") as progress:
         scores = run_blind_check(
             out,
             judged,
-            quick=quick,
-            scale=None if share == 1.0 else FULL.part(share),
+            scale=QUICK if quick else FULL.part(share),
             seed=seed,
-            jobs=jobs,
+            pool=Pool(jobs, backend, address),
             progress=progress,
             oracle=judged,
+            opponent=joint_least_squares if opponent else None,
         )
     write_blind(out, scores, {"command": command_line()})
     return Result(summary(scores), f"written to {out}", read_json(out / "blind.json"))

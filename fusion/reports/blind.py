@@ -11,7 +11,7 @@ from terrafusion.fusion.reports.plots import blind as plots
 
 Scores = Mapping[str, Any]
 VERDICTS = ["no_gap", "effect", "ambiguous", "parameters", "unknown", "crash"]
-MET = {True: "met", False: "missed", None: "not measured"}
+MET = {True: "met", False: "missed", None: ""}
 
 
 def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | None = None) -> None:
@@ -22,33 +22,35 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
     """
     sheet = plots.plot_sheet(scores)
     write_png(out / "sheet.png", sheet)
-    met = [t["met"] for t in scores["targets"]]
+    met = [row["diagnosis"]["met"] for row in scores["headline"] if row["target"]]
+    own = scores["figures"]["diagnosis"]
     lead = (
         f"Of {len(met)} targets {met.count(True)} are met, {met.count(False)} are missed, {met.count(None)} "
-        f"not measured. {len(scores['crashes'])} trials ended in a crash, which counts as a wrong answer. "
+        f"not measured. {len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
         "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
         f"all answers were in. Plant {plots.plant_name(scores)}."
     )
     write_page(
         out / "report.html", "blind.html.j2", f"Blind check of the diagnosis, {scores['trials']} trials",
         lead=lead, provenance=provenance, packages=TWIN_LIBRARIES,
-        targets=[
-            [t["name"], rounded(t["value"]), f"{t['sign']} {t['target']:g}", MET[t["met"]]]
-            for t in scores["targets"]
+        methods=list(scores["figures"]),
+        headline=[
+            [row["name"], *(measured(row[m]) for m in scores["figures"]), target_text(row["target"]),
+             MET[row["diagnosis"]["met"]]]
+            for row in scores["headline"]
         ],
         sheet=sheet, kinds=VERDICTS,
         verdicts=[
             [family, *(str(counts.get(kind, 0)) for kind in VERDICTS)]
-            for family, counts in scores["verdicts"].items()
+            for family, counts in own["verdicts"].items()
             if counts
         ],
-        class_sizes=", ".join(f"{family} {rounded(size)}" for family, size in scores["class_size"].items()),
-        effects=[
-            [e["effect"], *(rate_text(e[name]) for name in ("power", "top1", "unknown"))]
-            for e in scores["effects"]
+        settings=[
+            [setting, *(measured({"value": rate["rate"], **rate}) for rate in (
+                own["false_alarms"][setting], effects["power"], effects["right"]))]
+            for setting, effects in own["settings"].items()
         ],
-        confusion=plots.plot_confusion(scores),
-        shrink=[_shrink_row(plots.FAMILY_LABELS[family], s) for family, s in scores["shrink"].items()],
+        confusion=plots.plot_confusion(own["confusion"]),
     )  # fmt: skip
 
 
@@ -57,25 +59,33 @@ def rounded(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g}"
 
 
-def rate_text(rate: Mapping[str, Any]) -> str:
-    """`hits / count (low to high)`."""
-    if not rate["count"]:
-        return "–"
-    return f"{rate['hits']} / {rate['count']} ({rate['low']:.2f} to {rate['high']:.2f})"
+def measured(found: Mapping[str, Any]) -> str:
+    """`hits of count (low to high)` of a rate, else the value."""
+    if not found.get("count"):
+        return rounded(found["value"])
+    return f"{found['hits']} of {found['count']} ({found['low']:.2f} to {found['high']:.2f})"
+
+
+def target_text(target: list[float] | None) -> str:
+    """`<= 0.1`, `>= 0.9`, or a range."""
+    if target is None:
+        return ""
+    low, high = target
+    if low in (0.0, 1.0) and high != 1.0:
+        return f"<= {high:g}"
+    return f">= {low:g}" if high == 1.0 else f"{low:g} to {high:g}"
 
 
 def summary(scores: Scores) -> list[str]:
-    """The result in a few lines of text."""
-    alarms = rate_text(scores["false_alarms"]["all"])
-    plant, crashes = plots.plant_name(scores), len(scores["crashes"])
-    lines = [f"{scores['trials']} trials of plant {plant}, {crashes} crashes; false alarms {alarms}"]
-    width = max(len(t["name"]) for t in scores["targets"])
-    for t in scores["targets"]:
-        met = "MISSED" if t["met"] is False else MET[t["met"]]
-        lines.append(f"{t['name']:{width}s}  {rounded(t['value']):>7s}  {t['sign']} {t['target']:g}  {met}")
-    return lines
-
-
-def _shrink_row(label: str, s: Mapping[str, Any]) -> list[str]:
-    mean, same, oracle = (rounded(s[key]) for key in ("mean", "beside_oracle", "oracle"))
-    return [label, mean, str(s["count"]), same, oracle, str(s["count_oracle"])]
+    """The headline as text: a figure, its 95 % interval, the same of the opponent, the target."""
+    methods = list(scores["figures"])
+    crashes = ", ".join(f"{len(f['crashes'])} of the {m}" for m, f in scores["figures"].items())
+    rows = [
+        [row["name"], *(measured(row[m]) for m in methods), target_text(row["target"]),
+         MET[row["diagnosis"]["met"]]]
+        for row in scores["headline"]
+    ]  # fmt: skip
+    table = [["", *methods, "target", ""], *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    lines = ["  ".join(f"{cell:{w}s}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in table]
+    return [f"{scores['trials']} trials of plant {plots.plant_name(scores)}; crashes: {crashes}", *lines]

@@ -1,12 +1,13 @@
-"""Trials given to a diagnosis, and its answers: one line of JSON a trial, written at once."""
+"""Trials given to a diagnosis and its opponent, and their answers: one line of JSON a trial."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,10 +16,11 @@ from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.gap.blind import seal
-from terrafusion.twin.gap.blind.plan import VEHICLE, Trial, specs
+from terrafusion.twin.gap.blind.plan import RUNS, VEHICLE, Trial, specs
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 ORACLE = "oracle.jsonl"
+DIAGNOSIS, OPPONENT = "diagnosis", "opponent"
 LANES = 160  # runs of the plant in one batch (about 5 MB each)
 
 
@@ -30,6 +32,16 @@ class Answer(Protocol):
 
 
 Diagnose = Callable[..., Answer]  # diagnose(runs, references, vehicle, *, seed) -> Answer
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Where answers are computed: `backend` and `address` as for `executors.open_workers`; `jobs` trials at
+    once."""
+
+    jobs: int = 1
+    backend: str = "loky"
+    address: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,31 +56,34 @@ class BlindCase:
 
 def cases(trials: Sequence[Trial]) -> Iterator[BlindCase]:
     """The trials' recordings, simulated lazily."""
-    from terrafusion.twin.gap.blind.plant.run import record
-
-    vehicle = load_vehicle(VEHICLE)
-    for block in _blocks(trials):
-        many, names = [spec for trial in block for spec in specs(trial)], list[str]()
-        for trial in block:
-            names += [f"run-{i + 1}" for i in range(trial.runs)]
-            names += [f"reference-{i + 1}" for i in range(trial.references)]
-        recordings = iter(record(many, names=names))
-        for trial in block:
-            runs = tuple(next(recordings) for _ in range(trial.runs))
-            references = tuple(next(recordings) for _ in range(trial.references))
-            yield BlindCase(trial.trial, runs, references, vehicle)
-
-
-def _blocks(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
-    """Trials whose runs are computed together."""
-    block: list[Trial] = []
+    vehicle, block = load_vehicle(VEHICLE), list[Trial]()
     for trial in trials:
-        if block and sum(t.runs + t.references for t in (*block, trial)) > LANES:
-            yield block
+        if sum(RUNS + t.references for t in (*block, trial)) > LANES:
+            yield from _simulated(block, vehicle)
             block = []
         block.append(trial)
-    if block:
-        yield block
+    yield from _simulated(block, vehicle)
+
+
+def _simulated(block: Sequence[Trial], vehicle: VehicleParams) -> Iterator[BlindCase]:
+    """Trials whose runs are computed together, those of equal length in one batch."""
+    from terrafusion.twin.gap.blind.plant.run import record
+
+    wanted = [spec for trial in block for spec in specs(trial)]
+    names = [f"run-{i + 1}" for i in range(RUNS)]
+    names = [n for t in block for n in (*names, *(f"reference-{i + 1}" for i in range(t.references)))]
+    made: dict[int, Recording] = {}
+    for seconds in dict.fromkeys(spec.duration_s() for spec in wanted):
+        some = [i for i, spec in enumerate(wanted) if spec.duration_s() == seconds]
+        made |= zip(some, record([wanted[i] for i in some], names=[names[i] for i in some]), strict=True)
+    first = 0
+    for trial in block:
+        split, end = first + RUNS, first + RUNS + trial.references
+        runs, references = (
+            tuple(made.pop(i) for i in range(*ends)) for ends in ((first, split), (split, end))
+        )
+        yield BlindCase(trial.trial, runs, references, vehicle)
+        first = end
 
 
 def answered(folder: Path, name: str = seal.ANSWERS) -> dict[str, dict[str, Any]]:
@@ -87,74 +102,87 @@ def answered(folder: Path, name: str = seal.ANSWERS) -> dict[str, dict[str, Any]
 def answer_all(
     folder: Path,
     trials: Sequence[Trial],
-    diagnose: Diagnose,
-    jobs: int,
+    methods: Mapping[str, Diagnose],
+    pool: Pool,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Diagnoses the trials that have no answer yet; closes the answers when all are stored."""
+    """Answers of all `methods` to the trials that have none yet; closes the answers when all are stored."""
     done = answered(folder)
     _rewrite(folder, done)  # without a line that was cut off
     missing = [trial for trial in trials if trial.trial not in done]
     seal.forbid(folder)
     try:
-        with open_workers("loky", jobs) as pool, (folder / seal.ANSWERS).open("a", encoding="utf-8") as file:
-            questions = ((case, diagnose, folder) for case in cases(missing))
-            for entry in pool.results(answer, questions):
-                file.write(json.dumps(entry) + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-                done[entry["trial"]] = entry
-                if progress is not None:
-                    progress(len(done) / len(trials))
+        questions = ((case, methods, folder) for case in cases(missing))
+        for entry in _stored(folder / seal.ANSWERS, questions, pool):
+            done[entry["trial"]] = entry
+            if progress is not None:
+                progress(len(done) / len(trials))
     finally:
         seal.permit(folder)
     _rewrite(folder, done)
     seal.close(folder)
 
 
-def answer(case: BlindCase, diagnose: Diagnose, sealed: Path | None) -> dict[str, Any]:
-    """One answer. An exception of the diagnosis is recorded: it counts as wrong.
+def _stored(path: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> Iterator[dict[str, Any]]:
+    """Entries as they come, each appended to the file."""
+    with (
+        open_workers(pool.backend, pool.jobs, pool.address) as found,
+        path.open("a", encoding="utf-8") as file,
+    ):
+        # Recordings are large: no more of them at once than are worked on soon.
+        workers = dataclasses.replace(found, at_once=found.at_once or 2 * pool.jobs)
+        for entry in workers.results(answer, questions):
+            file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+            yield entry
+
+
+def answer(case: BlindCase, methods: Mapping[str, Diagnose], sealed: Path | None) -> dict[str, Any]:
+    """Answers of all methods: {"trial", method: {"seconds", "error", "answer"}}. An exception is recorded: it
+    counts as wrong.
 
     The process cannot open the labels in the folder `sealed`.
     """
     if sealed is not None:
         seal.forbid(sealed)
+    return {"trial": case.trial, **{name: _answer(case, method) for name, method in methods.items()}}
+
+
+def _answer(case: BlindCase, method: Diagnose) -> dict[str, Any]:
     begun = time.perf_counter()
     try:
-        given = diagnose(case.runs, case.references, case.vehicle, seed=0).to_json()
+        given = method(case.runs, case.references, case.vehicle, seed=0).to_json()
         json.dumps(given, allow_nan=False)
         error = None
     except Exception as problem:
         given, error = None, f"{type(problem).__name__}: {problem}"
-    seconds = round(time.perf_counter() - begun, 3)
-    return {"trial": case.trial, "seconds": seconds, "error": error, "answer": given}
+    return {"seconds": round(time.perf_counter() - begun, 3), "error": error, "answer": given}
 
 
-def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, jobs: int) -> dict[str, float]:
+def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, pool: Pool) -> dict[str, float]:
     """Share of the gap that disappears where the diagnosis is given the true effects, by trial.
 
-    For trials whose answer has a share, once the labels are open; `oracle.jsonl` stores the results. The
-    oracle is called as the diagnosis, with `effects`, the names of the candidates.
+    For single effects whose answer has a share, once the labels are open; `oracle.jsonl` stores the results.
+    The oracle is called as the diagnosis, with `effects`, the names of the candidates.
     """
-    with_share = {t for t, entry in answered(folder).items() if _share(entry)}
+    with_share = {t for t, entry in answered(folder).items() if _share(entry) is not None}
     done = answered(folder, ORACLE)
     asked = [t for t in trials if t.trial in with_share and t.family in ("same", "shifted")]
     effects = {t.trial: t.effects() for t in asked}
-    missing = [t for t in asked if t.trial not in done]
-    with open_workers("loky", jobs) as pool, (folder / ORACLE).open("a", encoding="utf-8") as file:
-        questions = ((c, functools.partial(oracle, effects=effects[c.trial]), None) for c in cases(missing))
-        for entry in pool.results(answer, questions):
-            done[entry["trial"]] = entry
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
+    questions = (
+        (case, {DIAGNOSIS: functools.partial(oracle, effects=effects[case.trial])}, None)
+        for case in cases([t for t in asked if t.trial not in done])
+    )
+    done |= {entry["trial"]: entry for entry in _stored(folder / ORACLE, questions, pool)}
     shares = {t: _share(entry) for t, entry in done.items()}
     return {t: float(share) for t, share in shares.items() if share is not None}
 
 
-def _share(entry: dict[str, Any]) -> float | None:
-    return ((entry["answer"] or {}).get("shrink") or {}).get("share")
+def _share(entry: Mapping[str, Any]) -> float | None:
+    return ((entry[DIAGNOSIS]["answer"] or {}).get("shrink") or {}).get("share")
 
 
-def _rewrite(folder: Path, entries: dict[str, dict[str, Any]]) -> None:
+def _rewrite(folder: Path, entries: Mapping[str, dict[str, Any]]) -> None:
     lines = "".join(json.dumps(entries[name]) + "\n" for name in sorted(entries))
     write_atomically(folder / seal.ANSWERS, lambda part: part.write_text(lines, encoding="utf-8"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -74,6 +75,12 @@ def guess(runs: Any, references: Any, vehicle: Any, *, seed: int = 0) -> Fixed:
     return Fixed(diagnosis("effect", [(names[which], 0.5)], [names[which]]))
 
 
+def slow_guess(runs: Any, references: Any, vehicle: Any, *, seed: int = 0) -> Fixed:
+    """The same in a tenth of a second: time to be killed in."""
+    time.sleep(0.1)
+    return guess(runs, references, vehicle, seed=seed)
+
+
 def breaking(runs: Any, references: Any, vehicle: Any, *, seed: int = 0) -> Fixed:
     """A diagnosis that fails."""
     raise np.linalg.LinAlgError("singular")
@@ -86,3 +93,10 @@ def short_cases(trials: Sequence[Trial]) -> Iterator[BlindCase]:
         record([RunSpec(vehicle, soil, (Segment(1.0),), seed=t.seed % 997) for t in trials]) if trials else []
     )
     return (BlindCase(t.trial, (run,), (), vehicle) for t, run in zip(trials, runs, strict=True))
+
+
+def without_times(scores: dict[str, Any]) -> dict[str, Any]:
+    """Scores without what depends on the clock."""
+    figures = {name: {**some, "seconds": None} for name, some in scores["figures"].items()}
+    rows = [row for row in scores["headline"] if not row["name"].startswith("seconds")]
+    return {**scores, "figures": figures, "headline": rows}

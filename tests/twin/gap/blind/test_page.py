@@ -17,37 +17,52 @@ from tests.twin.gap.blind import blind_answers as fake
 
 
 def test_the_page_tells_every_score(tmp_path: Path) -> None:
-    """Targets, effects and verdicts of a full check; figures are inside; nothing points outside."""
+    """Both methods, settings and verdicts of a full check; figures are inside; nothing points outside."""
     trials = plan(0, FULL)
     answers = {
-        t.trial: {"trial": t.trial, "seconds": 1.0, "error": None, "answer": fake.perfect(t)} for t in trials
+        t.trial: {
+            name: {"seconds": 1.0, "error": None, "answer": content(t)}
+            for name, content in (("diagnosis", fake.perfect), ("opponent", fake.guessed))
+        }
+        for t in trials
     }
-    scores = score(trials, answers)
+    scores = score(trials, answers, methods=("diagnosis", "opponent"))
     write_blind(tmp_path, scores, {"command": "terrafusion gap-blind"})
     page = (tmp_path / "report.html").read_text()
-    for words in ("868 trials", "false alarms", "imu_yaw_misalignment", "wheel_wobble", "gap-blind"):
+    for words in (
+        f"{len(trials)} trials",
+        "false alarms",
+        "Confusion",
+        "wrong soil label",
+        "opponent",
+    ):
         assert words in page
     assert "http" not in page
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
-    assert sum("met" in line for line in summary(scores)) >= 12
+    told = summary(scores)
+    assert any(
+        "false alarms, same drives" in line and "0 of 200" in line and "200 of 200" in line for line in told
+    )
+    assert sum(line.endswith("met") for line in told) >= 12
     _, ax = plots.plot_power(scores)
-    assert len(ax.containers) == 10  # three families and pairs on two drives, and the nulls
+    assert len(ax.containers) == 4  # two methods, two forms
 
 
 def test_the_page_of_a_check_without_answers(tmp_path: Path) -> None:
     """Nothing detected, nothing to rank: every panel stands, no number is made up."""
-    tiny = CheckSize(nulls=0, effects=1, outside=0, pairs=0, runs=1, references=1, severities=(4.0,))
+    tiny = CheckSize(nulls=0, other_nulls=0, effects=1, other_effects=0, harder=0, outside=0, pairs=0)
     scores = score(plan(0, tiny), {})
     write_blind(tmp_path, scores)
     assert "not measured" in (tmp_path / "report.html").read_text()
-    assert json.loads(json.dumps(scores, allow_nan=False))["unknown"]["recall"]["rate"] is None
+    stored = json.loads(json.dumps(scores, allow_nan=False))
+    assert stored["figures"]["diagnosis"]["unknown"]["recall"]["rate"] is None
 
 
 def test_the_command_writes_and_continues(
     terrafusion: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tiny = CheckSize(nulls=1, effects=0, outside=0, pairs=0, runs=1, references=1)
-    monkeypatch.setattr("terrafusion.twin.gap.blind.check.QUICK", tiny)
+    tiny = CheckSize(nulls=1, other_nulls=0, effects=0, other_effects=0, harder=0, outside=0, pairs=0)
+    monkeypatch.setattr("terrafusion.twin.gap.blind.plan.QUICK", tiny)
     monkeypatch.setattr("terrafusion.twin.gap.diagnose", fake.guess)
     monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)
     out = tmp_path / "out"
@@ -57,8 +72,9 @@ def test_the_command_writes_and_continues(
         assert "false alarms" in done.out
         assert done.err == ""
     scores = json.loads((out / "blind.json").read_text())
-    assert scores["schema"] == "terrafusion.gap-blind/1"
-    assert (scores["trials"], scores["crashes"]) == (1, [])
+    assert scores["schema"] == "terrafusion.gap-blind/2"
+    assert scores["trials"] == 1
+    assert list(scores["figures"]) == ["diagnosis", "opponent"]
     assert terrafusion("gap-blind", "--quick", "--seed", 9, "--out", out).refused("another seed")
 
 
@@ -67,9 +83,9 @@ def test_a_share_is_of_the_full_check(
 ) -> None:
     monkeypatch.setattr("terrafusion.twin.gap.diagnose", fake.guess)
     monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)
-    done = terrafusion("gap-blind", "--share", 0.01, "--out", tmp_path)
+    done = terrafusion("gap-blind", "--share", 0.01, "--no-opponent", "--out", tmp_path)
     assert done.status == 0, done.err
     assert json.loads((tmp_path / "blind.json").read_text())["trials"] == len(plan(0, FULL.part(0.01)))
-    assert terrafusion("gap-blind", "--share", 0.5, "--quick", "--out", tmp_path / "b").status == 2
-    assert terrafusion("gap-blind", "--share", 0, "--out", tmp_path / "b").status == 2
+    for wrong in (["--share", 0.5, "--quick"], ["--share", 0], ["--backend", "dask"], ["--backend", "slurm"]):
+        assert terrafusion("gap-blind", *wrong, "--out", tmp_path / "b").status == 2
     assert not (tmp_path / "b").exists()

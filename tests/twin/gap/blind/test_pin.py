@@ -16,7 +16,7 @@ from terrafusion.twin.gap.blind.plan import CheckSize
 from terrafusion.twin.model.soil import load_soil
 from tests.twin.gap.blind import blind_answers as fake
 
-TINY = CheckSize(nulls=1, effects=0, outside=0, pairs=0, runs=1, references=1)
+TINY = CheckSize(nulls=1, other_nulls=0, effects=0, other_effects=0, harder=0, outside=0, pairs=0)
 
 
 def test_the_plant_is_the_pinned_one() -> None:
@@ -35,8 +35,11 @@ def test_a_number_of_a_soil_changes_the_version(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_source_file_changes_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pin, "BESIDE_PLANT", pin.BESIDE_PLANT[1:])
+    """Plant, shapes, and beside them drives and severities."""
+    monkeypatch.setattr(pin, "PLANT", (*pin.PLANT, "rates.py"))
     assert pin.plant_sha256.__wrapped__() != pin.PINNED
+    monkeypatch.setattr(pin, "TRIALS", pin.TRIALS[1:])
+    assert pin.trials_sha256.__wrapped__() != pin.trials_sha256()
 
 
 def test_a_check_names_its_plant_and_is_not_continued_on_another(

@@ -1,0 +1,171 @@
+"""The opponent of the blind check: joint bounded least squares, as engineers identify a simulator today.
+
+The parameters of each effect's first form are all free at once. The twin is calibrated to the references,
+each reference gives one estimate more (their scatter goes into sigma), and the judged runs are fitted
+together by `scipy.optimize.least_squares` on rollouts of the same twin. An effect is claimed where change
+over sigma is significant (Student's t, Bonferroni over all parameters); the largest is ranked first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
+from terrafusion.twin.gap.data.logs import prepared, starting_model, with_common_channels
+from terrafusion.twin.gap.data.poses import aligned_start
+from terrafusion.twin.gap.data.samples import sample_map
+from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
+from terrafusion.twin.model.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+
+SIGNIFICANCE = 0.05
+PRIOR = 10.0  # 1 sigma of every parameter in typical sizes: bounds what the data leave open
+CALIBRATION_RUNS, FEWEST_REFERENCES, STEPS = 3, 3, 4
+LEAST_SIGMA = 0.2  # least sigma of a channel in that of its data sheet
+INSIDE = 1e-6  # the fit starts so far inside its bounds
+
+
+@dataclass(frozen=True)
+class LeastSquaresAnswer:
+    """What the fit claims, in the form of `diagnosis.json` as far as it is scored."""
+
+    content: dict[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        return self.content
+
+
+class _Fit:
+    """Residuals of logs and their derivatives by all parameters x (P,), in typical sizes."""
+
+    def __init__(self, model: Model, candidates: Candidates) -> None:
+        self.model, self.candidates = model, candidates
+        self.keys, self.scale = candidates.keys, candidates.scale
+        self.low, self.high = candidates.bounds(range(len(self.keys)))
+        self.sigma: dict[str, float] = {}  # of a channel's residual, in that of its data sheet
+
+    def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> tuple[Array, Array]:
+        """Residual (n,) and its derivatives (n, P), the pose at each window's start projected out."""
+        effects = dict(zip(self.keys, (x * self.scale).tolist(), strict=True))
+        model = dataclasses.replace(self.model, effects=effects)
+        run = linearise(log, model, self.candidates, log.start, None if derivatives else ())
+        found = channel_sensitivities(log, run)
+        found = moved_to(log, found, log.start, aligned_start(log, [s.value for s in found], log.start))
+        parts, windows = [], []
+        for i, window, rows in sample_map(log).blocks:
+            observed, s = log.observed[i], found[i]
+            sigma = observed.sigma[rows, None] * self.sigma.get(observed.channel, 1.0)
+            error = (observed.value[rows] - s.value[rows])[:, None]
+            parts.append(np.hstack([error, -s.by_effect[rows], s.by_pose[rows]]) / sigma)
+            windows.append(np.full(len(rows), window))
+        whole, window_of_row = np.concatenate(parts), np.concatenate(windows)
+        for window in np.unique(window_of_row):
+            mine = window_of_row == window
+            Q, sizes, _ = np.linalg.svd(whole[mine, -3:], full_matrices=False)
+            Q = Q[:, sizes > 1e-6 * max(float(sizes[0]), 1e-12)]
+            whole[mine] -= Q @ (Q.T @ whole[mine])
+        return whole[:, 0], whole[:, 1:-3]
+
+    def calibrated(self, logs: Sequence[PreparedLog]) -> Array:
+        """Parameters (P,) of the logs together; sets each channel's sigma to the residual they leave."""
+        x = self.one_step(np.zeros(len(self.keys)), logs)
+        left = [(self.of(log, x, False)[0], sample_map(log).blocks) for log in logs]
+        for i, observed in enumerate(logs[0].observed):
+            own = [e[np.concatenate([np.full(len(r), k) for k, _, r in blocks]) == i] for e, blocks in left]
+            self.sigma[observed.channel] = max(float(np.sqrt(np.mean(np.concatenate(own) ** 2))), LEAST_SIGMA)
+        return x
+
+    def one_step(self, x: Array, logs: Sequence[PreparedLog]) -> Array:
+        """Bounded Gauss-Newton step from x on the logs together."""
+        from scipy.optimize import lsq_linear
+
+        parts = [self.of(log, x) for log in logs]
+        information = sum((J.T @ J for _, J in parts), np.eye(len(x)) / PRIOR**2)
+        factor = np.linalg.cholesky(information).T
+        gradient = sum((J.T @ e for e, J in parts), np.zeros(len(x)))
+        goal = factor @ x - np.linalg.solve(factor.T, gradient)
+        return np.asarray(lsq_linear(factor, goal, (self.low, self.high)).x)
+
+
+def first_forms(every: Candidates) -> Candidates:
+    """The first form of each effect."""
+    forms = {h.effect: h for h in reversed(every.hypotheses)}
+    kept = [forms[effect] for effect in every.effects]
+    columns = [i for h in kept for i in h.columns]
+    keys = tuple(every.keys[i] for i in columns)
+    hypotheses = (dataclasses.replace(h, columns=tuple(columns.index(i) for i in h.columns)) for h in kept)
+    return Candidates(
+        keys, every.scale[columns], every.low[columns], every.high[columns],
+        tuple(every.units[i] for i in columns), tuple(hypotheses),
+        tuple(k for k in every.moving if k in keys), every.world_fixed & {*keys},
+    )  # fmt: skip
+
+
+def joint_least_squares(
+    runs: Sequence[Recording], references: Sequence[Recording], vehicle: VehicleParams, *, seed: int = 0
+) -> LeastSquaresAnswer:
+    """The opponent's answer; arguments as those of `diagnose` (nothing is drawn from the seed).
+
+    Raises:
+        DataError: too few references, or a log lacks a channel that is needed.
+        TerrafusionError: the twin diverges.
+    """
+    from scipy.optimize import least_squares
+
+    if len(references) < FEWEST_REFERENCES:
+        raise DataError(f"{len(references)} references", remedy=f"give at least {FEWEST_REFERENCES}")
+    candidates = first_forms(Candidates.of())
+    model, soil, _ = starting_model([*runs, *references], vehicle, None)
+    logs = with_common_channels(prepared([*runs, *references], model, soil, "auto"))
+    judged, normal = logs[: len(runs)], logs[len(runs) :]
+    fit = _Fit(model, candidates)
+    base = fit.calibrated(normal[:CALIBRATION_RUNS])
+    single = np.array([fit.one_step(base, [log]) for log in normal])
+    prior = np.eye(len(base)) / PRIOR
+    found = least_squares(
+        lambda x: np.concatenate([*(fit.of(log, x, False)[0] for log in judged), prior @ (x - base)]),
+        np.clip(base, fit.low + INSIDE, fit.high - INSIDE),
+        lambda x: np.concatenate([*(fit.of(log, x)[1] for log in judged), prior]),
+        (fit.low, fit.high),
+        max_nfev=STEPS,
+    )
+    scatter = single.var(axis=0, ddof=1)
+    variance = np.maximum(np.diag(np.linalg.inv(found.jac.T @ found.jac)), scatter / len(judged))
+    sigma = np.sqrt(variance + scatter / len(single))
+    return LeastSquaresAnswer(_claims(fit, found.x - single.mean(axis=0), sigma, len(single)))
+
+
+def _claims(fit: _Fit, change: Array, sigma: Array, references: int) -> dict[str, Any]:
+    """The answer from changes (P,) and sigmas (P,), in typical sizes."""
+    from scipy.stats import t as student
+
+    limit = float(student.ppf(1.0 - SIGNIFICANCE / (2.0 * len(change)), references - 1))
+    z, forms = np.abs(change) / sigma, {h.effect: h.columns for h in fit.candidates.hypotheses}
+    strength = {effect: float(z[list(columns)].max()) for effect, columns in forms.items()}
+    ranked = sorted(strength, key=lambda e: -strength[e])
+    likelihood = np.exp([0.5 * (strength[e] ** 2 - strength[ranked[0]] ** 2) for e in ranked])
+    sizes = {"value": change, "sigma": sigma}
+    named = [e for e in ranked if strength[e] > limit]
+    causes = [
+        {
+            "effect": e, "class": [e], "probability": float(p), "explained_share": None,
+            "parameters": {
+                fit.keys[i]: {name: float(x[i] * fit.scale[i]) for name, x in sizes.items()} for i in forms[e]
+            },
+        }
+        for e, p in zip(ranked, likelihood / likelihood.sum(), strict=True)
+    ]  # fmt: skip
+    verdict = "no_gap" if not named else "parameters" if named == [SOIL_STRENGTH] else "effect"
+    gap = {"detected": bool(named), "statistic": strength[ranked[0]]}
+    return {"gap": gap, "verdict": verdict, "causes": causes, "named": named, "shrink": None}
