@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ import typer
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.workers import AddressOption, BackendOption, check_backend
 
 OUTPUT = Output(
     "Folder for blind.json, report.html and the sealed labels.",
@@ -37,9 +39,10 @@ def gap_blind(
     ] = 1.0,
     jobs: Annotated[int, typer.Option(min=1, help="Trials that are diagnosed at once.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
-    backend: Annotated[str, typer.Option(help="loky: this machine; dask: a cluster.")] = "loky",
-    address: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="The Dask cluster's scheduler.")
+    backend: BackendOption = "loky",
+    address: AddressOption = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.0, help="Begin no trial later, and score those answered by then.")
     ] = None,
     opponent: Annotated[
         bool, typer.Option("--opponent/--no-opponent", help="Joint least squares on the same trials.")
@@ -67,10 +70,7 @@ def gap_blind(
 
     if quick and share < 1.0:
         raise typer.BadParameter("a quick check has its own size", param_hint="--share")
-    if backend not in ("loky", "dask"):
-        raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
-    if (address is not None) != (backend == "dask"):
-        raise typer.BadParameter("goes with --backend dask, which needs it", param_hint="--address")
+    check_backend(backend, address)
     # Processes, or threads inside.
     judged = partial(diagnose, jobs=1) if jobs > 1 or backend == "dask" else diagnose
     with progress_bar("diagnosing") as progress:
@@ -83,6 +83,7 @@ def gap_blind(
             progress=progress,
             oracle=judged,
             opponent=joint_least_squares if opponent else None,
+            minutes=math.inf if minutes is None else minutes,
         )
     write_blind(out, scores, {"command": command_line()})
     return Result(summary(scores), f"written to {out}", read_json(out / "blind.json"))

@@ -14,7 +14,7 @@ EXTRAS = {
     "compiler": ("ziglang", "a C compiler for the twin, where the machine has none"),
     "parquet": ("pyarrow", "`terrafusion sweep`"),
     "rerun": ("rerun", "`replay --rerun`, for the Rerun viewer"),
-    "cluster": ("distributed", "`--backend dask` of sweep, benchmark and terrain train"),
+    "cluster": ("distributed", "`--backend dask` of sweep, benchmark, gap-blind and terrain train"),
     "live": ("cyclonedds", "`live` on a robot, over DDS"),
     "foxglove": ("foxglove", "`live --foxglove`"),
 }

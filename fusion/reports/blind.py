@@ -88,4 +88,5 @@ def summary(scores: Scores) -> list[str]:
     table = [["", *methods, "target", ""], *rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
     lines = ["  ".join(f"{cell:{w}s}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in table]
-    return [f"{scores['trials']} trials of plant {plots.plant_name(scores)}; crashes: {crashes}", *lines]
+    count = f"{scores['trials']} of {scores.get('planned', scores['trials'])}"
+    return [f"{count} trials of plant {plots.plant_name(scores)}; crashes: {crashes}", *lines]

@@ -313,14 +313,31 @@ STUDIES = (
     Study(
         "blind",
         "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
-        ("terrafusion", "gap-blind", "--share", "0.05", "--seed", "7", "--jobs", "2", "--out", OUT),
+        (
+            "terrafusion",
+            "gap-blind",
+            "--share",
+            "0.1",
+            "--seed",
+            "7",
+            "--jobs",
+            "2",
+            "--minutes",
+            "26",
+            "--out",
+            OUT,
+        ),
         40,
         {
-            f"{method}{figure}": rf"{name} {{2,}}"
-            + r"(?:\S+ )*\S+ {2,}" * column
-            + r"((?:\S+ )*?\S+)(?: {2,}|$)"
-            for column, method in enumerate(("", "opponent_"))
-            for figure, name in BLIND_FIGURES.items()
+            "trials": r"(\d+ of \d+) trials",
+            "plant": r".* trials of plant (\w+)",
+            **{
+                f"{method}{figure}": rf"{name} {{2,}}"
+                + r"(?:\S+ )*\S+ {2,}" * column
+                + r"((?:\S+ )*?\S+)(?: {2,}|$)"
+                for column, method in enumerate(("", "opponent_"))
+                for figure, name in BLIND_FIGURES.items()
+            },
         },
         "sheet.png",
     ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -105,8 +106,11 @@ def answer_all(
     methods: Mapping[str, Diagnose],
     pool: Pool,
     progress: Callable[[float], None] | None = None,
+    minutes: float = math.inf,
 ) -> None:
-    """Answers of all `methods` to the trials that have none yet; closes the answers when all are stored."""
+    """Answers of all `methods` to the trials that have none yet; closes the answers when all are stored, or
+    after so many minutes."""
+    until_s = time.monotonic() + 60.0 * minutes
     done = answered(folder)
     _rewrite(folder, done)  # without a line that was cut off
     missing = [trial for trial in trials if trial.trial not in done]
@@ -117,6 +121,8 @@ def answer_all(
             done[entry["trial"]] = entry
             if progress is not None:
                 progress(len(done) / len(trials))
+            if time.monotonic() > until_s:
+                break
     finally:
         seal.permit(folder)
     _rewrite(folder, done)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ def run_blind_check(
     progress: Callable[[float], None] | None = None,
     oracle: Diagnose | None = None,
     opponent: Diagnose | None = None,
+    minutes: float = math.inf,
 ) -> dict[str, Any]:
     """Scores of a diagnosis on sealed trials; `blind.json` in the folder `out` holds them too.
 
@@ -50,6 +52,8 @@ def run_blind_check(
         pool: where the trials are answered; by default in this process.
         oracle: the diagnosis once more, given the true `effects`: how far the gap could shrink.
         opponent: another diagnosis on the same trials.
+        minutes: after which no trial is begun: those that are answered by then are scored. Their order is
+            random.
 
     Raises:
         ConfigError: the folder holds a check of another seed, scale, plant or set of methods.
@@ -62,17 +66,17 @@ def run_blind_check(
     public = {
         "seed": seed,
         "scale": dataclasses.asdict(scale),
-        "trials": len(trials),
         "plant_sha256": plant_sha256(),
         "trials_sha256": trials_sha256(),
         "methods": list(methods),
     }
     _seal_labels(folder, to_text(trials), public)
     if not (folder / seal.CLOSED).is_file():
-        answer_all(folder, trials, methods, pool, progress)
-    opened = from_text(seal.unseal(folder))
+        answer_all(folder, trials, methods, pool, progress, minutes)
+    answers = answered(folder)
+    opened = [trial for trial in from_text(seal.unseal(folder)) if trial.trial in answers]
     best = {} if oracle is None else ask_oracle(folder, opened, oracle, pool)
-    scores = {**score(opened, answered(folder), best, list(methods)), **public}
+    scores = {**score(opened, answers, best, list(methods)), **public, "planned": len(trials)}
     text = json.dumps(scores, indent=1, allow_nan=False)
     write_atomically(folder / RESULT, lambda part: part.write_text(text + "\n", encoding="utf-8"))
     return scores

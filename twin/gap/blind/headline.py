@@ -10,9 +10,9 @@ Target = tuple[float, float]
 
 TARGETS: tuple[tuple[str, str, Target | None], ...] = (
     ("false alarms, same drives", "false_alarms.same drives", (0.0, 0.05)),
-    ("the same, upper bound", "false_alarms.same drives.high", (0.0, 0.10)),
+    ("upper bound of that, same drives", "false_alarms.same drives.high", (0.0, 0.10)),
     ("false alarms, other drives", "false_alarms.other drives", (0.0, 0.05)),
-    ("the same, upper bound", "false_alarms.other drives.high", (0.0, 0.10)),
+    ("upper bound of that, other drives", "false_alarms.other drives.high", (0.0, 0.10)),
     ("power at d' 5", "power_all.5", None),
     ("power at d' 10", "power_all.10", (0.5, 1.0)),
     ("power at d' 25", "power_all.25", (0.9, 1.0)),

@@ -374,6 +374,17 @@ def test_a_check_resumes_where_it_was_stopped(tmp_path: Path) -> None:
     assert fake.without_times(resumed) == fake.without_times(whole)
 
 
+@pytest.mark.usefixtures("quickly")
+def test_a_check_that_runs_out_of_time_scores_what_is_answered(tmp_path: Path) -> None:
+    """A prefix of the random order; no trial that was not asked counts as a crash."""
+    scores = run_blind_check(tmp_path, fake.guess, scale=TINY, seed=2, minutes=0.0)
+    assert (scores["trials"], scores["planned"]) == (1, len(plan(2, TINY)))
+    assert scores["figures"]["diagnosis"]["crashes"] == []
+    assert list(answered(tmp_path)) == ["trial-0001"]
+    again = run_blind_check(tmp_path, fake.guess, scale=TINY, seed=2)
+    assert again == scores  # the labels are open: nothing is answered any more
+
+
 # The scores
 
 
