@@ -1,4 +1,4 @@
-"""Reports as HTML: each is one file without scripts, and nothing in it points outside.
+"""Reports as HTML: each is one file, and nothing in it points outside.
 
 `templates/` holds the text of the reports. Jinja escapes every value that a template shows; figures become
 SVG inside the file. The same values give the same bytes.

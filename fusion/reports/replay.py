@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
@@ -19,9 +19,7 @@ from terrafusion.fusion.reports import replay_text
 from terrafusion.fusion.reports.page import write_page
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter, replay_map, style
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from terrafusion.fusion.reports.plots.sheet import Sheet, bokeh_script
 
 MOST_CHANGES = 20
 """How many of the weight changes the report lists; `weights.jsonl` has them all."""
@@ -100,25 +98,25 @@ def write_report(
     """
     if not runs:
         raise ValueError("a report needs at least one run")
-    metrics = [run.metrics for run in runs]
+    names, metrics = [run.name for run in runs], [run.metrics for run in runs]
     pair = replay_text.pick_pair(metrics)
     shown, compared = runs[pair[0]], len(runs) > 1
     if compared:
-        lead = replay_text.summary_of_many([run.name for run in runs], metrics, *pair)
+        lead = replay_text.summary_of_many(names, metrics, *pair)
     else:
         lead = replay_text.summary_of_one(metrics[0])
     apart_s = max(2.0, recording.duration_s() / MOST_MARKS)
     marked = plots.important_changes(shown.estimate.changes, MOST_CHANGES, apart_s)
     rows = replay_text.score_rows(metrics)
-    figures = _figures(shown, recording, held_out, outages, wheel_radius_m, marked)
-    figures |= _comparison(runs, recording, held_out, outages) if compared else {"error_runs": None}
+    sheet, innovations = _draw(runs, shown, recording, held_out, outages, wheel_radius_m, marked)
     labelled = recording.terrain is not None
     calibrations = {run.name: [cells(row) for row in run.metrics.get("calibration", ())] for run in runs}
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
         overview=overview, runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
-        scores=rows, rivals=replay_text.shown_rivals(rows), figures=figures,
-        verdicts=replay_text.verdicts([run.name for run in runs], metrics), assumed=_assumed(runs),
+        scores=rows, rivals=replay_text.shown_rivals(rows), tiles=replay_text.tiles(rows, names, pair[0]),
+        panels=sheet.panels, plots=sheet.json(), library=bokeh_script(), innovations=innovations,
+        verdicts=replay_text.verdicts(names, metrics), assumed=_assumed(runs),
         reference=replay_text.REFERENCE[shown.scores.against or "truth"],
         label_strip=" The strip on top is the log's own label." if labelled else "",
         calibrations={name: rows for name, rows in calibrations.items() if rows},
@@ -127,47 +125,48 @@ def write_report(
     )  # fmt: skip
 
 
-def _figures(
+def _draw(
+    runs: Sequence[ReportRun],
     shown: ReportRun,
     recording: Recording,
     held_out: Gnss | None,
     outages: Sequence[Outage],
     wheel_radius_m: float | None,
     marked: Sequence[WeightChange],
-) -> dict[str, Figure | None]:
-    """The figures of one run; None where there is nothing to draw."""
-    estimate, errors, start = shown.estimate, shown.scores.errors, recording.start_ns
-    at: dict[str, Any] = {"outages": outages}
-    skid_steering, innovations = plots.has_skid_steering(estimate), bool(estimate.innovations)
-    return {
-        "map": replay_map.plot_map(estimate, recording, errors=errors, held_out=held_out, **at)[0],
-        "errors": None if errors is None else plots.plot_errors(errors, start, **at),
-        "terrain": plots.plot_terrain(estimate, start, recording=recording)[0],
-        "slip": plots.plot_slip(estimate, start, **at)[0],
-        "skid_steering": plots.plot_skid_steering(estimate, start, **at) if skid_steering else None,
-        "weights": plots.plot_weights(estimate, start, marked=marked),
-        "speeds": plots.plot_speeds(estimate, recording, wheel_radius_m=wheel_radius_m, **at)[0],
-        "biases": replay_filter.plot_biases(estimate, start),
-        "innovations": replay_filter.plot_innovations(estimate, start, **at) if innovations else None,
-    }
+) -> tuple[Sheet, list[str]]:
+    """All figures, and the keys of those of the innovations."""
+    start, estimate = recording.start_ns, shown.estimate
+    estimates = {run.name: run.estimate for run in runs}
+    colours = _colours(runs)
+    scored = {run.name: run.scores.errors for run in runs if run.scores.errors is not None}
+    sheet = Sheet(_duration_s(estimates, recording), outages)
+    replay_map.plot_map(
+        sheet, estimates, shown.name, recording, colours, errors=scored, held_out=held_out, outages=outages
+    )
+    if scored:
+        plots.plot_error_runs(sheet, scored, start, colours)
+    plots.plot_slip(sheet, estimates, shown.name, start, colours)
+    if shown.name in scored:
+        plots.plot_errors(sheet, scored[shown.name], start)
+    plots.plot_terrain(sheet, estimate, recording)
+    plots.plot_skid_steering(sheet, estimate, start)
+    plots.plot_weights(sheet, estimate, start, marked=marked)
+    plots.plot_speeds(sheet, estimate, recording, wheel_radius_m=wheel_radius_m)
+    replay_filter.plot_biases(sheet, estimate, start)
+    return sheet, replay_filter.plot_innovations(sheet, estimate, start)
 
 
-def _comparison(
-    runs: Sequence[ReportRun], recording: Recording, held_out: Gnss | None, outages: Sequence[Outage]
-) -> dict[str, Figure | None]:
-    """The figures of several runs, each in the colour of its mode unless two runs share a mode."""
+def _colours(runs: Sequence[ReportRun]) -> dict[str, str]:
+    """The colour of each run: that of its mode, unless two runs share a mode."""
     modes = [str(run.metrics["mode"]) for run in runs]
     keys = [mode if modes.count(mode) == 1 else run.name for run, mode in zip(runs, modes, strict=True)]
-    colours = {
-        run.name: style.colour_of(key, style.MODE_COLOURS) for run, key in zip(runs, keys, strict=True)
-    }
-    scored = {run.name: run.scores.errors for run in runs if run.scores.errors is not None}
-    estimates = {run.name: run.estimate for run in runs}
-    look: dict[str, Any] = {"colours": colours, "outages": outages}
-    return {
-        "map_runs": replay_map.plot_map_runs(estimates, recording, held_out=held_out, **look),
-        "error_runs": replay_map.plot_error_runs(scored, recording.start_ns, **look) if scored else None,
-    }
+    return {run.name: style.colour_of(key, style.MODE_COLOURS) for run, key in zip(runs, keys, strict=True)}
+
+
+def _duration_s(estimates: Mapping[str, Estimate], recording: Recording) -> float:
+    """From the start of the recording to the end of it and of all estimates."""
+    ends = [int(one.trajectory.t_ns[-1]) for one in estimates.values() if len(one.trajectory)]
+    return max([recording.duration_s(), *((end - recording.start_ns) * 1e-9 for end in ends)])
 
 
 def _change_rows(estimate: Estimate, start_ns: int, marked: Sequence[WeightChange]) -> list[list[str]]:

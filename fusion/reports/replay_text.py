@@ -16,6 +16,11 @@ Metrics = Mapping[str, Any]
 
 RIVALS = {"dead_reckoning_m": "dead reckoning", "gnss_m": "receiver alone"}
 """Baselines by their key in `metrics.json`."""
+TILES = (
+    "Position error", "error at its end", "Consistency", "95 % within", "Estimated distance",
+    "Wheel measurements rejected", "Real-time factor",
+)  # fmt: skip
+"""Scores a report opens with, the first three that there are."""
 REFERENCE = {"truth": "the ground truth", "gnss_held_out": "held-out GNSS fixes"}
 
 
@@ -134,6 +139,38 @@ def _outage_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
 
 def _rivals(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
     return tuple(None if errors is None else errors.get(key) for key in RIVALS)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One of the numbers a report opens with."""
+
+    label: str
+    value: str
+    about: str
+
+
+def tiles(rows: Sequence[ScoreRow], names: Sequence[str], ours: int) -> list[Tile]:
+    """The three numbers to see first: error, end of an outage, consistency; else what was scored.
+
+    Args:
+        names: of the runs.
+        ours: the run whose numbers they are; below stand those of the others and of the baselines.
+    """
+    found: list[ScoreRow] = []
+    for word in TILES:
+        scored = (row for row in rows if word in row.label and row.values[ours] is not None)
+        found += [row for row in scored if row not in found][:1]
+    return [Tile(row.label, row.text(ours), _beside(row, names, ours)) for row in found[:3]]
+
+
+def _beside(row: ScoreRow, names: Sequence[str], ours: int) -> str:
+    others = [f"{name} {row.text(i)}" for i, name in enumerate(names) if i != ours]
+    others += [
+        f"{name} {row.rival_text(k)}" for k, name in enumerate(RIVALS.values()) if row.rivals[k] is not None
+    ]
+    aim = ["1 is consistent"] if row.goal == "one" else []
+    return "; ".join([*([names[ours]] if len(names) > 1 else []), *others, *aim])
 
 
 def shown_rivals(rows: Sequence[ScoreRow]) -> list[tuple[int, str]]:

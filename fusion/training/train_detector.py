@@ -98,8 +98,8 @@ def train(
     for windows, ground in training:
         rows[ground].append(features_of(windows))
     mixtures = {}
-    for ground, parts in rows.items():
-        x = np.vstack(parts)
+    for ground, features in rows.items():
+        x = np.vstack(features)
         try:
             fitted = fit_best(x, SIGMA_FLOOR, SLIP)
         except ValueError as error:

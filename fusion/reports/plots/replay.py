@@ -1,13 +1,9 @@
-"""Plots of one estimate over time: errors, slip, terrain, weights, speeds, skid steering.
-
-Times are seconds from `start_ns`, the start of the recording. Maps and comparisons of runs are in
-`replay_map`, innovations and biases in `replay_filter`.
-"""
+"""Figures over time of the replays of one drive: errors, ground and slip, weights, sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,186 +11,162 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.error_series import Errors
-from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.reports.plots import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 
 Array = NDArray[np.float64]
-TIME = "time from the start, s"
-_GNSS = style.SENSOR_COLOURS["gnss"]
+TIME = "time, s"
 _SIGMAS = (
-    ("wheel_sigma_mps", "wheel speed, m/s", "wheels", "-"),
-    ("slip_sigma", "slip", "slip", "-"),
-    ("side_slip_sigma", "side-slip", "side_slip", "--"),
+    ("wheel_sigma_mps", "wheel speed, m/s", "wheels", "solid"),
+    ("slip_sigma", "slip", "slip", "solid"),
+    ("side_slip_sigma", "side-slip", "side_slip", "dashed"),
 )
 _FACTORS = (
-    ("gyro_inflation", "gyro", "gyro", "-"),
-    ("gyro_yaw_inflation", "gyro, yaw", "gyro", ":"),
-    ("accel_inflation", "accelerometer", "accel", "--"),
-    ("gnss_inflation", "GNSS", "gnss", "-"),
+    ("gyro_inflation", "gyro", "gyro", "solid"),
+    ("gyro_yaw_inflation", "gyro, yaw", "gyro", "dotted"),
+    ("accel_inflation", "accelerometer", "accel", "dashed"),
+    ("gnss_inflation", "GNSS", "gnss", "solid"),
 )
 """Weight of the policy file, its label, sensor and dashes."""
 _SKID_STEERING = (
     ("yaw_scale", "yaw scale", "#0072b2"),
     ("side_slip", "side-slip", "#d55e00"),
-    ("icr_x_m", "centre of\nrotation, m", "#009e73"),
+    ("icr_x_m", "centre of rotation, m", "#009e73"),
 )
 
 
-def plot_errors(errors: Errors, start_ns: int, *, outages: Sequence[Outage] = ()) -> Figure:
+def plot_error_runs(
+    sheet: Sheet, errors: Mapping[str, Errors], start_ns: int, colours: Mapping[str, str]
+) -> None:
+    """Horizontal distance between estimate and reference, a line a run."""
+    plot = sheet.add_time("error_runs", "position error, m", 240)
+    for name, one in errors.items():
+        distance = one.distance_m()
+        peak = [int(np.nanargmax(distance))] if np.isfinite(distance).any() else []
+        t = style.seconds(one.t_ns, start_ns)
+        plot.line(t, distance, name, colours[name], keep=peak)
+
+
+def plot_errors(sheet: Sheet, errors: Errors, start_ns: int) -> None:
     """East, north and heading error (deg) with the estimated band of two sigma."""
     t = style.seconds(errors.t_ns, start_ns)
     error, P = errors.position_error_m(), errors.covariance_m2
-    rows = [("east, m", error[:, 0], np.sqrt(P[:, 0, 0])), ("north, m", error[:, 1], np.sqrt(P[:, 1, 1]))]
+    rows = [
+        ("error_east", "east error, m", error[:, 0], np.sqrt(P[:, 0, 0])),
+        ("error_north", "north error, m", error[:, 1], np.sqrt(P[:, 1, 1])),
+    ]
     if np.isfinite(errors.reference_yaw_rad).any():
-        rows.append(("heading, deg", np.degrees(errors.yaw_error_rad()), np.degrees(errors.yaw_sigma_rad)))
-    fig, axes = style.canvases(len(rows), (9.0, 1.7 * len(rows) + 0.4))
-    for ax, (label, value, sigma) in zip(axes, rows, strict=True):
-        style.band(ax, t, np.zeros(len(t)), sigma, "#6baed6", alpha=0.35, label="estimated ±2 sigma")
-        style.line(ax, t, value, _GNSS, "error", linewidth=1.0)
-        ax.set_ylim(*_error_limits(value, sigma))
-        shade_outages(ax, outages)
-        style.format_axes(ax, y=label)
-    style.legend_above(axes[0])
-    axes[-1].set_xlabel(TIME, fontsize=9)
-    return fig
+        yaw, sigma = np.degrees(errors.yaw_error_rad()), np.degrees(errors.yaw_sigma_rad)
+        rows.append(("error_heading", "heading error, deg", yaw, sigma))
+    for key, label, value, sigma in rows:
+        plot = sheet.add_time(key, label, 170, limits=_error_limits(value, sigma))
+        plot.band(t, np.zeros(len(t)), sigma, "estimated ±2 sigma", "#6baed6", alpha=0.35)
+        plot.line(t, value, "error", style.SENSOR_COLOURS["gnss"])
 
 
 def plot_slip(
-    estimate: Estimate, start_ns: int, *, outages: Sequence[Outage] = (), ax: Axes | None = None
-) -> tuple[Figure, Axes]:
-    """Estimated slip with its band of two sigma, over the most probable terrain."""
-    fig, ax = style.canvas(ax, (9.0, 2.9))
+    sheet: Sheet, estimates: Mapping[str, Estimate], shown: str, start_ns: int, colours: Mapping[str, str]
+) -> None:
+    """Estimated slip of each run, and the band of two sigma and the most probable ground of the one shown."""
+    estimate = estimates[shown]
     t, s, sigma = style.seconds(estimate.trajectory.t_ns, start_ns), estimate.slip, estimate.slip_sigma
-    patches = _shade_terrain(ax, estimate, t)
-    style.band(ax, t, s, sigma, "#0072b2", alpha=0.3)
-    style.line(ax, t, s, "#003f6b", linewidth=1.1)
-    _mark_outages(ax, outages)
     rows = style.thin(len(t))
     edges = np.concatenate([(s - 2 * sigma)[rows], (s + 2 * sigma)[rows]])
     low, high = style.robust_limits(edges, include=(0.0, 0.1))
-    ax.set_ylim(max(low, -1.2), min(high, 1.2))
-    if len(t):
-        ax.set_xlim(t[0], max(t[-1], t[0] + 1e-3))
-    style.format_axes(ax, x=TIME, y="slip (1 - v / wheel speed)")
-    style.legend_above(ax, handles=patches)
-    return fig, ax
+    plot = sheet.add_time("slip", "slip (1 - v / wheel speed)", 220, limits=(max(low, -1.2), min(high, 1.2)))
+    _shade_terrain(plot, estimate, t)
+    plot.band(t, s, sigma, f"±2 sigma ({shown})", colours[shown])
+    for name, one in estimates.items():
+        plot.line(style.seconds(one.trajectory.t_ns, start_ns), one.slip, name, colours[name])
 
 
-def plot_terrain(
-    estimate: Estimate, start_ns: int, *, recording: Recording | None = None, ax: Axes | None = None
-) -> tuple[Figure, Axes]:
+def plot_terrain(sheet: Sheet, estimate: Estimate, recording: Recording) -> None:
     """Probabilities of the terrain classes, stacked; a strip on top shows the label of the log, if any."""
-    fig, ax = style.canvas(ax, (9.0, 2.7))
-    t = style.seconds(estimate.trajectory.t_ns, start_ns)
+    t = style.seconds(estimate.trajectory.t_ns, recording.start_ns)
     rows = style.thin(len(t))
     p = np.nan_to_num(estimate.terrain[rows])
-    shown = [i for i in range(len(estimate.classes)) if p[:, i].max(initial=0.0) > 0.01]
-    if shown and len(rows):
-        names = [estimate.classes[i] for i in shown]
-        colours, labels = map(style.terrain_colour, names), map(style.label_text, names)
-        ax.stackplot(t[rows], *p[:, shown].T, colors=list(colours), labels=list(labels), linewidth=0)
-        ax.set_xlim(t[0], max(t[-1], t[0] + 1e-3))
-    top = 1.0
-    if recording is not None and recording.terrain is not None and len(recording.terrain):
-        _label_strip(ax, recording, t[-1] if len(t) else recording.duration_s())
-        top = 1.16
-    ax.set_ylim(0.0, top)
-    ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
-    style.format_axes(ax, x=TIME, y="probability")
-    style.legend_above(ax)
-    return fig, ax
+    labelled = recording.terrain is not None and len(recording.terrain) > 0
+    plot = sheet.add_time(
+        "terrain", "probability of the ground", 200, limits=(0.0, 1.16 if labelled else 1.0)
+    )
+    floor = np.zeros(len(rows))
+    for i, name in enumerate(estimate.classes):
+        if p[:, i].max(initial=0.0) > 0.01:
+            data = {"x": t[rows], "y1": floor, "y2": floor + p[:, i]}
+            plot.glyph("varea", data, style.label_text(name), style.terrain_colour(name), "area", alpha=0.85)
+            floor = floor + p[:, i]
+    if labelled:
+        _label_strip(plot, recording, float(t[-1]) if len(t) else recording.duration_s())
 
 
-def plot_weights(estimate: Estimate, start_ns: int, *, marked: Sequence[WeightChange] = ()) -> Figure:
+def plot_weights(
+    sheet: Sheet, estimate: Estimate, start_ns: int, *, marked: Sequence[WeightChange] = ()
+) -> None:
     """Noise of each sensor (log scale); the times of the changes `marked` are numbered from 1."""
-    fig, axes = style.canvases(2, (9.0, 4.2))
     t = style.seconds(estimate.trajectory.t_ns, start_ns)
-    marks = [(t_ns - start_ns) * 1e-9 for t_ns in change_numbers(marked)]
-    for ax, weights, label in zip(axes, (_SIGMAS, _FACTORS), ("1 sigma", "times data sheet"), strict=True):
-        for name, text, sensor, dashes in weights:
+    marks = np.array([(t_ns - start_ns) * 1e-9 for t_ns in change_numbers(marked)])
+    for key, weights, label in (
+        ("weight_sigmas", _SIGMAS, "1 sigma"),
+        ("weight_factors", _FACTORS, "times data sheet"),
+    ):
+        plot = sheet.add_time(key, label, 200, log=True)
+        top = 1.0e-6
+        for name, text, sensor, dash in weights:
             if name in estimate.weights:
-                colour = style.colour_of(sensor, style.SENSOR_COLOURS)
                 values = np.maximum(estimate.weights[name], 1e-6)
-                style.line(ax, t, values, colour, text, linestyle=dashes, linewidth=1.3)
-        ax.set_yscale("log")
-        low, high = ax.get_ylim()
-        wide = low > 0.0 and np.log10(high / low) > 2.5
-        style.plain_log_ticks(ax.yaxis, (1.0,) if wide else (1.0, 2.0, 5.0))
-        style.format_axes(ax, y=label)
-        style.legend_above(ax)
-        for t_s in marks:
-            ax.axvline(t_s, color="#888888", linewidth=0.6, linestyle=":")
-    _number_marks(axes[1], marks)
-    axes[-1].set_xlabel(TIME, fontsize=9)
-    return fig
+                top = max(top, float(np.nanmax(values, initial=top)))
+                plot.line(t, values, text, style.colour_of(sensor, style.SENSOR_COLOURS), dash=dash)
+        if len(marks) and len(t):
+            plot.glyph("vspan", {"x": marks}, "change, by its number", "#808080", "line", line_dash="dotted")
+            numbers = np.array([str(k) for k in range(1, len(marks) + 1)], dtype=object)
+            where = {"x": marks, "y": np.full(len(marks), 1.6 * top), "text": numbers}
+            plot.glyph(
+                "text", where, "change, by its number", "#808080", "line", text_font_size="10px",
+                text_align="center",
+            )  # fmt: skip
 
 
 def plot_speeds(
-    estimate: Estimate,
-    recording: Recording,
-    *,
-    wheel_radius_m: float | None = None,
-    outages: Sequence[Outage] = (),
-    ax: Axes | None = None,
-) -> tuple[Figure, Axes]:
+    sheet: Sheet, estimate: Estimate, recording: Recording, *, wheel_radius_m: float | None = None
+) -> None:
     """Forward speed of the wheels and as estimated, and of GNSS and truth where there are any."""
-    fig, ax = style.canvas(ax, (9.0, 2.9))
+    plot = sheet.add_time("speeds", "forward speed, m/s", 220)
     wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
-
-    def line(t_ns: NDArray[np.int64], speed: Array, colour: str, label: str, **options: Any) -> None:
-        style.line(ax, style.seconds(t_ns, recording.start_ns), speed, colour, label, **options)
-
+    start, colours = recording.start_ns, style.SENSOR_COLOURS
     if wheels is not None and len(wheels) and (wheels.unit == "mps" or wheel_radius_m is not None):
         speed = wheels.side_speeds_mps(wheel_radius_m or 1.0).mean(axis=1)
-        line(wheels.t_ns, speed, style.SENSOR_COLOURS["wheels"], "wheels", linewidth=0.8)
+        plot.line(style.seconds(wheels.t_ns, start), speed, "wheels", colours["wheels"], width=1.0)
     if gnss is not None and gnss.velocity_enu_mps is not None:
         speed = np.hypot(gnss.velocity_enu_mps[:, 0], gnss.velocity_enu_mps[:, 1])
-        colour = style.SENSOR_COLOURS["gnss_velocity"]
-        line(gnss.t_ns, speed, colour, "GNSS (absolute)", marker=".", linestyle="none", markersize=3)
+        rows = style.thin(len(speed))
+        t = style.seconds(gnss.t_ns, start)[rows]
+        plot.dots(t, speed[rows], "GNSS (absolute)", colours["gnss_velocity"], size=3.0)
     listed = recording.truth_channels
     if truth is not None and truth.twist_body is not None and (not listed or "velocity" in listed):
-        line(truth.t_ns, truth.twist_body[:, 0], style.TRUTH, "truth", linewidth=1.8, alpha=0.35)
+        t = style.seconds(truth.t_ns, start)
+        plot.line(t, truth.twist_body[:, 0], "truth", style.TRUTH_ON_ANY, width=2.4, alpha=0.6)
     path = estimate.trajectory
     if path.twist_body is not None:
         forward = path.twist_body[:, 0]
     else:
         forward = np.linalg.norm(estimate.velocity_mps[:, :2], axis=1)
-    line(path.t_ns, forward, _GNSS, "estimate", linewidth=1.1)
-    shade_outages(ax, outages)
-    style.format_axes(ax, x=TIME, y="forward speed, m/s")
-    style.legend_above(ax)
-    return fig, ax
+    plot.line(style.seconds(path.t_ns, start), forward, "estimate", colours["gnss"])
 
 
-def has_skid_steering(estimate: Estimate) -> bool:
-    """Whether `plot_skid_steering` has anything to show."""
-    names = (name for name, _, _ in _SKID_STEERING)
-    return bool(len(estimate.trajectory)) and any(series(estimate, name) is not None for name in names)
-
-
-def plot_skid_steering(estimate: Estimate, start_ns: int, *, outages: Sequence[Outage] = ()) -> Figure:
-    """Yaw scale, side-slip and centre of rotation over time, with bands of two sigma."""
-    fig, axes = style.canvases(len(_SKID_STEERING), (9.0, 1.5 * len(_SKID_STEERING) + 0.6))
+def plot_skid_steering(sheet: Sheet, estimate: Estimate, start_ns: int) -> None:
+    """Yaw scale, side-slip and centre of rotation, those that were estimated, with bands of two sigma."""
     t = style.seconds(estimate.trajectory.t_ns, start_ns)
     rows = style.thin(len(t))
-    for ax, (name, label, colour) in zip(axes, _SKID_STEERING, strict=True):
+    for name, label, colour in _SKID_STEERING:
         state = series(estimate, name)
-        if state is not None:
-            value, sigma = state
-            style.band(ax, t, value, sigma, colour, alpha=0.2, label="±2 sigma")
-            style.line(ax, t, value, colour, "estimate")
-            edges = np.concatenate([(value - 2 * sigma)[rows], (value + 2 * sigma)[rows]])
-            ax.set_ylim(*style.robust_limits(edges, include=(0.0,)))
-        shade_outages(ax, outages)
-        style.format_axes(ax, y=label)
-    style.legend_above(axes[0])
-    axes[-1].set_xlabel(TIME, fontsize=9)
-    return fig
+        if state is None or not len(t):
+            continue
+        value, sigma = state
+        edges = np.concatenate([(value - 2 * sigma)[rows], (value + 2 * sigma)[rows]])
+        plot = sheet.add_time(f"skid_{name}", label, 160, limits=style.robust_limits(edges, include=(0.0,)))
+        plot.band(t, value, sigma, "±2 sigma", colour)
+        plot.line(t, value, "estimate", colour)
 
 
 def important_changes(
@@ -222,62 +194,36 @@ def change_numbers(changes: Sequence[WeightChange]) -> dict[int, int]:
     return {t_ns: number for number, t_ns in enumerate(dict.fromkeys(c.t_ns for c in changes), 1)}
 
 
-def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:
-    """Shade the outages of GNSS; they are named once in the legend."""
-    for i, outage in enumerate(outages):
-        label = "no GNSS" if i == 0 else None
-        end = outage.start_s + outage.seconds
-        ax.axvspan(outage.start_s, end, color=style.OUTAGE, zorder=0, linewidth=0, label=label)
-
-
-def _mark_outages(ax: Axes, outages: Sequence[Outage]) -> None:
-    """Mark the outages by a bar at the foot, where the background is taken."""
-    foot = ax.get_xaxis_transform()
-    for outage in outages:
-        x = (outage.start_s, outage.start_s + outage.seconds)
-        ax.plot(x, (0.02, 0.02), transform=foot, color=style.HELD_OUT, linewidth=4, solid_capstyle="butt")
-        text = ax.text(x[0], 0.05, "no GNSS", transform=foot, fontsize=7, color=style.HELD_OUT, clip_on=True)
-        text.set_in_layout(False)
-
-
-def _shade_terrain(ax: Axes, estimate: Estimate, t_s: Array) -> list[Any]:
-    """Colour the background by the most probable class; returns the legend's patches."""
-    from matplotlib.patches import Patch
-
+def _shade_terrain(plot: Plot, estimate: Estimate, t_s: Array) -> None:
+    """Colour the background by the most probable class."""
     if not len(t_s) or not estimate.classes:
-        return []
+        return
     rows = style.thin(len(t_s), 600)
     label, t_s = estimate.dominant_terrain()[rows], t_s[rows]
-    patches: dict[str, Any] = {}
-    for first, last in style.runs_of(label):
-        name = str(label[first])
+    runs = style.runs_of(label)
+    strips: dict[str, list[tuple[float, float]]] = {}
+    for first, last in runs:
+        strips.setdefault(str(label[first]), []).append((t_s[first], t_s[min(last, len(t_s) - 1)]))
+    for name, edges in strips.items():
+        at = np.array(edges)
+        data: dict[str, Any] = {"x0": at[:, 0], "x1": at[:, 1]}
         colour = style.terrain_colour(name)
-        end = t_s[min(last, len(t_s) - 1)]
-        ax.axvspan(t_s[first], end, color=colour, alpha=0.3, linewidth=0, zorder=0)
-        patches.setdefault(name, Patch(color=colour, alpha=0.4, linewidth=0, label=style.label_text(name)))
-    return list(patches.values())
+        plot.glyph("vstrip", data, style.label_text(name), colour, "area", alpha=0.3, line_width=0)
 
 
-def _label_strip(ax: Axes, recording: Recording, end_s: float) -> None:
+def _label_strip(plot: Plot, recording: Recording, end_s: float) -> None:
     terrain = recording.terrain
     assert terrain is not None
     t = style.seconds(terrain.t_ns, recording.start_ns)
-    for first, last in style.runs_of(terrain.label):
-        stop = t[last] if last < len(t) else max(end_s, t[-1])
-        colour = style.terrain_colour(terrain.label[first])
-        ax.fill_between([t[first], stop], 1.05, 1.15, color=colour, linewidth=0)
-    source = style.label_text(terrain.source, 14)
-    ax.text(1.005, 1.10 / 1.16, source, transform=ax.transAxes, fontsize=7, va="center")
-
-
-def _number_marks(ax: Axes, times_s: Sequence[float]) -> None:
-    """Numbers 1, 2, ... below the top edge, in two heights so that neighbours do not cover each other."""
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "#888888", "linewidth": 0.5}
-    for i, t in enumerate(times_s):
-        ax.annotate(
-            str(i + 1), (t, 0.93 if i % 2 == 0 else 0.82), xycoords=("data", "axes fraction"), fontsize=7,
-            ha="center", va="center", bbox=box,
-        )  # fmt: skip
+    runs = style.runs_of(terrain.label)
+    data = {
+        "left": t[[first for first, _ in runs]],
+        "right": np.array([t[last] if last < len(t) else max(end_s, t[-1]) for _, last in runs]),
+        "bottom": np.full(len(runs), 1.05),
+        "top": np.full(len(runs), 1.15),
+        "colour": np.array([style.terrain_colour(terrain.label[first]) for first, _ in runs], dtype=object),
+    }
+    plot.glyph("quad", data, "", None, "area", line_width=0)
 
 
 def _error_limits(error: Array, sigma: Array) -> tuple[float, float]:

@@ -1,9 +1,8 @@
-"""Maps of a drive, and several runs of one drive compared."""
+"""Map of the replays of one drive, over truth and fixes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,242 +14,145 @@ from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.outputs.replay_files import is_local
 from terrafusion.fusion.reports.plots import style
-from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
+from terrafusion.fusion.reports.plots.ellipses import (
+    ELLIPSE_SIGMAS,
+    ellipse_rows,
+    ellipses,
+    rejected_fixes,
+)
+from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]
-
-ELLIPSE_SIGMAS = 2.0
-"""Half axes of the ellipses; two dimensions have 1 - exp(-2) = 86 % of their probability inside."""
-ELLIPSE_S, MOST_ELLIPSES = 10.0, 60
-"""Seconds between ellipses; longer drives get at most so many, outside and inside outages."""
-_DASHES = (0, (4, 3))
-_ESTIMATE = "#0072b2"
+MOST = 2 * style.MAX_POINTS
 
 
 def plot_map(
-    estimate: Estimate,
-    recording: Recording,
-    *,
-    errors: Errors | None = None,
-    held_out: Gnss | None = None,
-    outages: Sequence[Outage] = (),
-    ax: Axes | None = None,
-) -> tuple[Figure, Axes]:
-    """The path coloured by terrain with ellipses of two sigma, over truth and fixes; outages are edged."""
-    fig, ax = style.canvas(ax, _map_size([estimate]))
-    path = estimate.trajectory
-    local = is_local(estimate)
-    if local:
-        handles = _draw_aligned_reference(ax, estimate, errors)
-    else:
-        handles = _draw_references(ax, recording, held_out, rejected_fixes(estimate))
-    for i, outage in enumerate(outages):
-        rows = np.flatnonzero(outage.covers(path.t_ns, recording.start_ns))
-        edge: dict[str, Any] = {"color": "#f4a582", "linewidth": 7.0, "alpha": 0.8, "zorder": 3.5}
-        drawn = _draw(ax, path.position_m[rows], "-", "no GNSS", solid_capstyle="round", **edge)
-        handles += drawn if i == 0 else []
-    handles += _draw_path(ax, estimate)
-    rings = ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages))
-    for i, ring in enumerate(rings):
-        label = f"{ELLIPSE_SIGMAS:g} sigma of position"
-        drawn = ax.plot(*ring.T, color=_ESTIMATE, linewidth=0.7, alpha=0.8, zorder=5, label=label)
-        handles += drawn if i == 0 else []
-    if len(path):
-        ends: dict[str, Any] = {"color": "#111111", "zorder": 6, "linestyle": "none"}
-        keep = style.thin(len(path), 2 * style.MAX_POINTS)
-        xy = path.position_m[keep, :2]
-        handles += ax.plot(*xy[0], "^", markersize=8, label="start", **ends)
-        handles += ax.plot(*xy[-1], "s", markersize=6, label="end", **ends)
-    frame = "of the local frame, m"
-    _finish(ax, handles, *((f"x {frame}", f"y {frame}") if local else ()))
-    return fig, ax
-
-
-def plot_map_runs(
+    sheet: Sheet,
     estimates: Mapping[str, Estimate],
+    shown: str,
     recording: Recording,
+    colours: Mapping[str, str],
     *,
-    colours: Mapping[str, str] | None = None,
+    errors: Mapping[str, Errors],
     held_out: Gnss | None = None,
     outages: Sequence[Outage] = (),
-) -> Figure:
-    """The paths of several runs, by name, over truth and GNSS fixes; thick where a run has no GNSS."""
-    from matplotlib.lines import Line2D
+) -> None:
+    """The path of each run over truth and fixes.
 
-    fig, ax = style.canvas(None, _map_size(list(estimates.values())))
-    handles = _draw_references(ax, recording, held_out)
-    for name, estimate in estimates.items():
-        colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
-        path = estimate.trajectory
-        label = style.label_text(name)
-        most = 2 * style.MAX_POINTS
-        handles += _draw(ax, path.position_m, "-", label, most, color=colour, linewidth=1.4, zorder=5)
-        for outage in outages:
-            inside = path.position_m[outage.covers(path.t_ns, recording.start_ns)]
-            _draw(ax, inside, "-", color=colour, linewidth=4.0, alpha=0.45, zorder=4)
-            _draw(ax, inside[-1:], "o", color=colour, markersize=6, markeredgecolor="white", zorder=6)
-    if outages:
-        label = "no GNSS (dot: its end)"
-        handles.append(Line2D([], [], color="#777777", linewidth=4, alpha=0.5, label=label))
-    _finish(ax, handles)
-    return fig
-
-
-def plot_error_runs(
-    errors: Mapping[str, Errors],
-    start_ns: int,
-    *,
-    colours: Mapping[str, str] | None = None,
-    outages: Sequence[Outage] = (),
-) -> Figure:
-    """Horizontal position error of several runs, by name, over time."""
-    fig, ax = style.canvas(None, (9.0, 3.0))
-    shade_outages(ax, outages)
-    for name, series in errors.items():
-        colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
-        distance = series.distance_m()
-        peak = [int(np.nanargmax(distance))] if np.isfinite(distance).any() else []
-        rows = style.thin(len(distance), keep=peak)
-        t = style.seconds(series.t_ns, start_ns)[rows]
-        ax.plot(t, distance[rows], color=colour, linewidth=1.2, label=style.label_text(name))
-    ax.set_ylim(bottom=0.0)
-    style.format_axes(ax, x=TIME, y="position error, m")
-    style.legend_above(ax)
-    return fig
-
-
-def rejected_fixes(estimate: Estimate) -> TimesNs:
-    """Times (N,) of the fixes whose position was rejected by a gate."""
-    rejected = [i.t_ns for i in estimate.innovations if i.sensor == "gnss" and not i.accepted]
-    return np.array(rejected, dtype=np.int64)
-
-
-def ellipse_rows(estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -> NDArray[np.int64]:
-    """Keyframes that get an ellipse: one in ten seconds, and one in two seconds in an outage.
-
-    An outage is one of `outages`, or where the estimate's status says so. The last keyframe of each is
-    among them: there the position is the least certain.
+    The run `shown` lies on a wide line in the colours of its most probable ground and has ellipses of two
+    sigma; its rejected fixes are marked. Thick lines: without GNSS.
     """
-    t_ns = estimate.trajectory.t_ns
-    alone = np.asarray(estimate.status == "outage")
-    for outage in outages:
-        alone |= outage.covers(t_ns, start_ns)
-    rows: list[int] = []
-    for inside, every_s in ((False, ELLIPSE_S), (True, ELLIPSE_S / 5.0)):
-        chosen = np.flatnonzero(alone == inside)
-        slot = ((t_ns[chosen] - start_ns) // round(every_s * 1e9)).astype(np.int64)
-        first = chosen[np.flatnonzero(np.diff(slot, prepend=-1))]
-        rows += first[style.thin(len(first), MOST_ELLIPSES)].tolist()
-    ends = np.flatnonzero(alone & ~np.append(alone[1:], False))
-    return np.unique(np.array([*rows, *ends.tolist()], dtype=np.int64))
+    estimate = estimates[shown]
+    local = is_local(estimate)
+    frame = ("x of the local frame, m", "y of the local frame, m") if local else ("east, m", "north, m")
+    plot = sheet.add_map("map", *frame)
+    _ground(plot, estimate)
+    if local:
+        _aligned_reference(plot, estimate, errors.get(shown))
+    else:
+        _references(plot, recording, held_out, rejected_fixes(estimate))
+    rings = ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages))
+    if len(rings):
+        x, y = _joined(list(rings)).T
+        label = f"{ELLIPSE_SIGMAS:g} sigma of position ({shown})"
+        plot.glyph("line", {"x": x, "y": y}, label, colours[shown], "line", line_width=0.8, alpha=0.8)
+    for name, one in estimates.items():
+        _run(plot, name, one, colours[name], recording.start_ns, outages, errors.get(name))
+    away = np.full(len(estimates), np.nan)
+    marks = {"x": away, "y": away, "colour": np.array([colours[name] for name in estimates], dtype=object)}
+    plot.glyph("scatter", marks, "", None, "dot", name="cursor marks", size=11, line_color=style.NEUTRAL)
+    path = estimate.trajectory.position_m[:, :2]
+    known = path[np.isfinite(path).all(axis=1)]
+    if len(known):
+        plot.dots(known[:1, 0], known[:1, 1], "start", style.TRUTH_ON_ANY, "triangle", 10.0)
+        plot.dots(known[-1:, 0], known[-1:, 1], "end", style.TRUTH_ON_ANY, "square", 8.0)
 
 
-def ellipses(estimate: Estimate, rows: NDArray[np.int64]) -> Array:
-    """Ellipses (K, 41, 2) of the position, m, at those of the keyframes `rows` whose covariance is known."""
+def _run(
+    plot: Plot,
+    name: str,
+    estimate: Estimate,
+    colour: str,
+    start_ns: int,
+    outages: Sequence[Outage],
+    errors: Errors | None,
+) -> None:
+    """One path, thick where it has no GNSS; its source has time, error and slip for the cursor."""
     path = estimate.trajectory
-    if path.covariance is None:
-        return np.zeros((0, 41, 2))
-    P = path.covariance[rows, :2, :2]
-    known = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
-    size, axes = np.linalg.eigh(P[known])
-    angle = np.linspace(0.0, 2.0 * np.pi, 41)
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = ring * ELLIPSE_SIGMAS * np.sqrt(np.maximum(size, 0.0))[:, None, :]
-    return np.asarray(np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[known], None, :2])
+    rows = style.thin(len(path), MOST)
+    t = style.seconds(path.t_ns, start_ns)[rows]
+    error = np.full(len(rows), np.nan)
+    if errors is not None and len(errors.t_ns):
+        known = style.seconds(errors.t_ns, start_ns)
+        error = np.interp(t, known, errors.distance_m(), left=np.nan, right=np.nan)
+    data = {"x": path.position_m[rows, 0], "y": path.position_m[rows, 1]}
+    more = {"t": t, "error": error, "slip": estimate.slip[rows]}
+    for outage in outages:
+        inside = path.position_m[outage.covers(path.t_ns, start_ns)]
+        if len(inside):
+            plot.line(inside[:, 0], inside[:, 1], name, colour, width=5.0, alpha=0.4)
+    plot.glyph("line", data, name, colour, "line", name=f"run {name}", more=more, line_width=1.8)
 
 
-def _draw(
-    ax: Axes, xyz: Array, form: str, label: str | None = None, most: int = style.MAX_POINTS, **options: Any
-) -> list[Any]:
-    xy = xyz[style.thin(len(xyz), most), :2]
-    return ax.plot(xy[:, 0], xy[:, 1], *filter(None, [form]), label=label, **options)
-
-
-def _draw_path(ax: Axes, estimate: Estimate) -> list[Any]:
-    """The path, coloured by the most probable terrain where there are classes; returns the handles."""
-    from matplotlib.collections import LineCollection
-    from matplotlib.lines import Line2D
-
-    keep = style.thin(len(estimate.trajectory), 2 * style.MAX_POINTS)
-    xy = estimate.trajectory.position_m[keep, :2]
-    if not len(xy):
-        return []
+def _ground(plot: Plot, estimate: Estimate) -> None:
+    """A wide line below the path, in the colour of the most probable class."""
+    rows = style.thin(len(estimate.trajectory), MOST)
+    xy = estimate.trajectory.position_m[rows, :2]
     if len(xy) < 2 or not estimate.classes:
-        return ax.plot(xy[:, 0], xy[:, 1], color=_ESTIMATE, linewidth=2.0, label="estimate")
-    label = estimate.dominant_terrain()[keep]
-    runs = style.runs_of(label)
-    colours = [style.terrain_colour(label[first]) for first, _ in runs]
-    lines = [xy[first : last + 1] for first, last in runs]
-    ax.add_collection(LineCollection(lines, colors=colours, linewidths=3.2, zorder=4))
-    names = dict.fromkeys(label.tolist())
-    return [
-        Line2D([], [], color=style.terrain_colour(name), linewidth=3, label=f"on {style.label_text(name)}")
-        for name in names
-    ]
+        return
+    label = estimate.dominant_terrain()[rows]
+    lines: dict[str, list[Array]] = {}
+    for first, last in style.runs_of(label):
+        lines.setdefault(str(label[first]), []).append(xy[first : last + 1])
+    for name, parts in lines.items():
+        x, y = _joined(parts).T
+        label_text, colour = f"on {style.label_text(name)}", style.terrain_colour(name)
+        plot.glyph("line", {"x": x, "y": y}, label_text, colour, "area", line_width=15.0, alpha=0.45)
 
 
-def _draw_aligned_reference(ax: Axes, estimate: Estimate, errors: Errors | None) -> list[Any]:
+def _joined(lines: list[Array]) -> Array:
+    """Lines (n, 2) as one, interrupted where one ends."""
+    gap = np.full((1, 2), np.nan)
+    return np.concatenate([piece for line in lines for piece in (line, gap)])
+
+
+def _aligned_reference(plot: Plot, estimate: Estimate, errors: Errors | None) -> None:
     """The reference moved into the local frame, by the inverse of the alignment of the scores."""
     if errors is None:
-        return []
+        return
     here = estimate.trajectory.positions_at(errors.t_ns)[:, :2]
     rows = np.isfinite(here + errors.estimate_m + errors.reference_m).all(axis=1)
     if rows.sum() < 2:
-        return []
+        return
     here, there = here[rows] @ [1.0, 1j], errors.estimate_m[rows] @ [1.0, 1j]
     turn = np.vdot(there - there.mean(), here - here.mean())
     turn = turn / abs(turn) if abs(turn) > 0.0 else 1.0
     moved = (errors.reference_m[rows] @ [1.0, 1j] - there.mean()) * turn + here.mean()
-    xy = np.column_stack([moved.real, moved.imag])
-    look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": _DASHES, "zorder": 7}
-    return _draw(ax, xy, "", "reference, moved to the start", 2 * style.MAX_POINTS, **look)
+    label = "reference, moved to the start"
+    plot.line(moved.real, moved.imag, label, style.TRUTH_ON_ANY, dash="dashed", most=MOST)
 
 
-def _draw_references(
-    ax: Axes, recording: Recording, held_out: Gnss | None, rejected_ns: TimesNs | None = None
-) -> list[Any]:
-    """Truth, and the fixes used, rejected and held out; returns the legend's handles."""
-    handles: list[Any] = []
+def _references(
+    plot: Plot, recording: Recording, held_out: Gnss | None, rejected_ns: NDArray[np.int64]
+) -> None:
+    """Truth, and the fixes used, rejected and held out."""
     truth, gnss = recording.truth, recording.gnss
-    if truth is not None and len(truth) and "position" in (recording.truth_channels or ("position",)):
-        look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": _DASHES, "zorder": 7}
-        handles += _draw(ax, truth.position_m, "", "truth", 2 * style.MAX_POINTS, **look)
     held_ns = held_out.t_ns if held_out is not None else np.zeros(0, dtype=np.int64)
     if gnss is not None and len(gnss):
         given = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, held_ns))
-        rejected = np.isin(given.t_ns, rejected_ns if rejected_ns is not None else [])
-        if rejected.any():
-            away = given.enu_m[rejected]
-            handles += _draw(
-                ax, away, "x", "GNSS rejected", len(away), color="#111111", markersize=5, zorder=6
-            )
-        used = given.enu_m[~rejected]
-        handles += _draw(ax, used, ".", "GNSS used", 800, color="#9a9a9a", markersize=4, zorder=2)
-    if held_out is not None and len(held_out):
-        ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 0.8, "markersize": 4}
-        colour = style.HELD_OUT
-        handles += _draw(ax, held_out.enu_m, "o", "GNSS held out", 400, color=colour, zorder=3, **ring)
-    return handles
+        rejected = np.isin(given.t_ns, rejected_ns)
+        _fixes(plot, given.enu_m[~rejected], "GNSS used", style.NEUTRAL, "circle", 800)
+        _fixes(plot, given.enu_m[rejected], "GNSS rejected", style.HELD_OUT, "x", len(given))
+    if held_out is not None:
+        _fixes(plot, held_out.enu_m, "GNSS held out", style.HELD_OUT, "ring", 400)
+    if truth is not None and len(truth) and "position" in (recording.truth_channels or ("position",)):
+        place = truth.position_m
+        plot.line(place[:, 0], place[:, 1], "truth", style.TRUTH_ON_ANY, dash="dashed", most=MOST)
 
 
-def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:
-    """Figure size, inches, that suits the extent of the drive: a long straight one gets a low map."""
-    points = np.concatenate([e.trajectory.position_m[:, :2] for e in estimates] or [np.zeros((0, 2))])
-    points = points[np.isfinite(points).all(axis=1)]
-    width, height = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
-    return 9.0, float(np.clip(7.0 * height / max(width, 1e-3), 2.2, 6.0)) + 0.7
-
-
-def _finish(ax: Axes, handles: list[Any], x: str = "east, m", y: str = "north, m") -> None:
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.margins(0.05)
-    ax.autoscale_view()
-    style.format_axes(ax, x=x, y=y)
-    if handles:
-        corner = (1.0, 1.0)
-        ax.legend(handles=handles, loc="upper left", bbox_to_anchor=corner, frameon=False, fontsize=8)
+def _fixes(plot: Plot, enu_m: Array, label: str, colour: str, marker: str, most: int) -> None:
+    if len(enu_m):
+        rows = style.thin(len(enu_m), most)
+        plot.dots(
+            enu_m[rows, 0], enu_m[rows, 1], label, colour, marker, {"x": 7.0, "circle": 2.5}.get(marker, 5.0)
+        )

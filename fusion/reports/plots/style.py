@@ -33,13 +33,13 @@ TERRAIN_COLOURS = {
 }
 SENSOR_COLOURS = {
     "gnss": "#0072b2",
-    "gnss_velocity": "#56b4e9",
+    "gnss_velocity": "#3d8fc0",
     "wheels": "#d55e00",
     "side_slip": "#8c510a",
     "gyro": "#009e73",
     "accel": "#cc79a7",
     "imu": "#009e73",
-    "slip": "#e69f00",
+    "slip": "#b07a00",
 }
 MODE_COLOURS = {
     "adaptive": "#0072b2",
@@ -51,6 +51,8 @@ MODE_COLOURS = {
 AXIS_COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Of x, y and z."""
 TRUTH, HELD_OUT, NEUTRAL = "#1a1a1a", "#cc3311", "#7f7f7f"
+TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#e69f00"
+"""The same where the background may be light or dark."""
 BEFORE, AFTER = "#d55e00", "#0072b2"
 OUTAGE, EXPECTED = "#ffe0b3", "#dddddd"
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")

@@ -23,7 +23,8 @@ from terrafusion.fusion.metrics.scores import score
 from terrafusion.fusion.outputs.linear_states import QUANTITIES, calibration, cells, series
 from terrafusion.fusion.outputs.replay_files import build_metrics, estimate_columns, final_status
 from terrafusion.fusion.outputs.ros_estimate import written_estimate
-from terrafusion.fusion.reports.plots.replay import has_skid_steering, plot_skid_steering
+from terrafusion.fusion.reports.plots.replay import plot_skid_steering
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -56,7 +57,6 @@ def metrics_of(d: Any, estimate: Estimate) -> dict[str, Any]:
 def test_a_series_is_there_only_where_the_state_was_estimated(drive: Any) -> None:
     plain = drive().estimate
     assert series(plain, "yaw_scale") is None
-    assert not has_skid_steering(plain)
     found = series(with_states(plain, calibrated=False), "side_slip")
     assert found is not None
     assert found[0] == pytest.approx(0.06)
@@ -116,9 +116,10 @@ def test_the_report_says_what_was_observed_and_what_could_not_be(drive: Any, tmp
 
 def test_the_plot_of_skid_steering_has_a_band_of_two_sigma(drive: Any) -> None:
     d = drive()
-    panels = plot_skid_steering(with_states(d.estimate, calibrated=False), d.recording.start_ns).axes
-    low, high = panels[0].collections[0].get_datalim(panels[0].transData).intervaly
-    assert high - low == pytest.approx(4 * 0.05)
+    sheet = Sheet(10.0)
+    plot_skid_steering(sheet, with_states(d.estimate, calibrated=False), d.recording.start_ns)
+    band = sheet.panels["skid_yaw_scale"].figure.renderers[0].data_source.data
+    assert band["y2"] - band["y1"] == pytest.approx(4 * 0.05, rel=1e-5)
 
 
 def test_diagnostics_carry_the_states(drive: Any) -> None:
