@@ -12,7 +12,6 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
-from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,7 +129,7 @@ def _plot_paths(ax: Axes, shown: Mapping[str, DemoRun], recording: Recording) ->
 
 
 def _plot_errors(ax: Axes, runs: Sequence[DemoRun], outage: Outage) -> None:
-    shade_outages(ax, [outage])
+    style.shade_outages(ax, [outage])
     for mode in (FIXED, ADAPTIVE):
         own = [run for run in runs if run.mode == mode]
         t_s = own[0].t_s
@@ -141,5 +140,5 @@ def _plot_errors(ax: Axes, runs: Sequence[DemoRun], outage: Outage) -> None:
         ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, alpha=0.18, linewidth=0)
         ax.plot(t_s[rows], middle[rows], color=colour, linewidth=1.6, label=f"{mode}: median, range")
     ax.set_ylim(bottom=0.0)
-    style.format_axes(ax, x=TIME, y=f"position error of {len(runs) // 2} drives, m")
+    style.format_axes(ax, x=style.TIME, y=f"position error of {len(runs) // 2} drives, m")
     style.legend_above(ax, columns=3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
@@ -20,6 +20,9 @@ from terrafusion.fusion.reports.page import write_page
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter, replay_map, style
 from terrafusion.fusion.reports.plots.sheet import Sheet, bokeh_script
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_CHANGES = 20
 """How many of the weight changes the report lists; `weights.jsonl` has them all."""

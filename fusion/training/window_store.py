@@ -46,11 +46,11 @@ class WindowStore:
         numbers = [[np.nan if value is None else value for value in _numbers(w)] for w in windows]
         imu = [np.column_stack([w.imu_t_s, w.gyro_radps, w.accel_mps2]) for w in windows]
         counts = np.array([len(samples) for samples in imu])
-        content = {"state": np.array(self.state), "numbers": np.array(numbers), "counts": counts}
+        table, state = np.array(numbers, dtype=float), np.array(self.state)
 
         def save(part: Path) -> None:
             with part.open("wb") as file:  # np.savez would add a suffix to a name
-                np.savez(file, imu=np.vstack(imu), **content)
+                np.savez(file, imu=np.vstack(imu), numbers=table, counts=counts, state=state)
 
         write_atomically(self._file(number), save)
 

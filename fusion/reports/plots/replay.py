@@ -16,7 +16,6 @@ from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 
 Array = NDArray[np.float64]
-TIME = "time, s"
 _SIGMAS = (
     ("wheel_sigma_mps", "wheel speed, m/s", "wheels", "solid"),
     ("slip_sigma", "slip", "slip", "solid"),

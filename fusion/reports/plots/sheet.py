@@ -140,7 +140,7 @@ class Plot:
         """A line, thinned to `most` points; `name` is that of its data, for the script."""
         rows = style.thin(len(x), most, keep=keep)
         form = "line" if dash == "solid" else "dash"
-        look = {"line_dash": dash, "line_width": width, "alpha": alpha}
+        look: dict[str, Any] = {"line_dash": dash, "line_width": width, "alpha": alpha}
         self.glyph("line", {"x": x[rows], "y": y[rows]}, label, colour, form, name=name, **look)
 
     def band(self, x: Array, y: Array, sigma: Array, label: str, colour: str, alpha: float = 0.25) -> None:
@@ -156,7 +156,11 @@ class Plot:
     ) -> None:
         """Points: "circle" filled, "ring", "x", "triangle" or "square"."""
         ring = marker == "ring"
-        look = {"fill_alpha": 0.0 if ring else 0.8, "size": size, "marker": "circle" if ring else marker}
+        look: dict[str, Any] = {
+            "fill_alpha": 0.0 if ring else 0.8,
+            "size": size,
+            "marker": "circle" if ring else marker,
+        }
         self.glyph("scatter", {"x": x, "y": y}, label, colour, "ring" if ring else "dot", **look)
 
     def glyph(

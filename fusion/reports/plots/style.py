@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.metrics.scores import Outage
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
@@ -57,6 +59,7 @@ BEFORE, AFTER = "#d55e00", "#0072b2"
 OUTAGE, EXPECTED = "#ffe0b3", "#dddddd"
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
 
+TIME = "time from the start, s"
 MAX_POINTS = 1200
 """Longer lines are thinned to this many points before they are drawn."""
 
@@ -142,6 +145,14 @@ def band(ax: Axes, t_s: Array, values: Array, sigma: Array, colour: str, **optio
     rows = thin(len(t_s))
     low, high = (values + k * sigma for k in (-2.0, 2.0))
     ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, linewidth=0, **options)
+
+
+def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:
+    """Shade the outages of GNSS; they are named once in the legend."""
+    for i, outage in enumerate(outages):
+        label = "no GNSS" if i == 0 else None
+        end = outage.start_s + outage.seconds
+        ax.axvspan(outage.start_s, end, color=OUTAGE, zorder=0, linewidth=0, label=label)
 
 
 def plain_log_ticks(axis: Axis, subs: Sequence[float] = (1.0, 2.0, 5.0)) -> None:

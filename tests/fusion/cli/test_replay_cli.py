@@ -91,7 +91,7 @@ def check_agreement(results: Results, start_ns: int) -> None:
     assert sum(metrics["terrain"].values()) == pytest.approx(1.0)
     assert metrics["log"] in results.report
     assert "<svg" in results.report or "data:image/" in results.report
-    assert 'src="http' not in results.report, "the report must be self-contained"
+    assert "default-src 'none'" in results.report, "the report must be self-contained"
 
 
 def check_verdict(results: Results, screen: str) -> None:
