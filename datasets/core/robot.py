@@ -124,6 +124,7 @@ class Known(Parsed):
 
 Ratio = Annotated[KnownNumber, Known(Quantity("", -0.5, 1.0))]
 Delay = Annotated[KnownNumber, Known(Quantity("s", -5.0, 5.0))]
+Tilt = Annotated[KnownNumber, Known(Quantity("rad", -0.8, 0.8))]
 Place = Annotated[KnownNumber, Known(Quantity("m", -20.0, 20.0, size=3))]
 
 
@@ -137,7 +138,8 @@ class SensorNumbers:
         yaw_factor: true yaw rate over that of the wheels and the track, where there is no gyro.
         wheel_scale: true distance over that of the wheels, less one; usual slip included.
         gnss_delay_s, wheel_delay_s: lateness of the stamps against those of the IMU.
-        imu_yaw_rad: angle about z at which the IMU is mounted, counter-clockwise seen from above.
+        imu_roll_rad, imu_pitch_rad, imu_yaw_rad: angles at which the IMU is mounted: readings turned about x,
+            then y, then z by them are in body axes. The first two are not learned while driving.
     """
 
     antenna_m: Place | None = None
@@ -147,6 +149,8 @@ class SensorNumbers:
     wheel_scale: Ratio | None = None
     gnss_delay_s: Delay | None = None
     wheel_delay_s: Delay | None = None
+    imu_roll_rad: Tilt | None = None
+    imu_pitch_rad: Tilt | None = None
     imu_yaw_rad: Annotated[KnownNumber, Known(Quantity("rad", -3.1416, 3.1416))] | None = None
 
 

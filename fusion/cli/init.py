@@ -74,6 +74,9 @@ def init(
     Example: terrafusion init drive.mcap --topic imu=/front/imu --drive tracked --track 0.62
     """
     from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.datasets.readers.formats import format_of
+    from terrafusion.datasets.readers.open import find_log
+    from terrafusion.datasets.readers.ros.streams import decoded_once
     from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
     from terrafusion.fusion.cli.inspect_page import print_lines
     from terrafusion.fusion.init.answers import Answers
@@ -93,20 +96,29 @@ def init(
     given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
     answers = Answers(vehicle_name or out.stem, **given)
     reading(None, topic, stamps, columns, repair_clock)  # reports wrong usage before anything is read
-    topics = choose_sensors(log, parse_topics(topic))
+    held: list[tuple[Any, Recording]] = []
+    is_bag = format_of(find_log(log)[0]).name in ("ros1", "ros2")
 
     def open_log(rig: Rig | None) -> Recording:
         from terrafusion.datasets.readers import open_recording
 
+        receiver = rig.sensors.gnss if rig is not None else None
+        if held and held[-1][0] == receiver:
+            return held[-1][1]
         entries = [f"{channel}={name}" for channel, name in topics.items()]
         recording = open_recording(log, **reading(rig, entries, stamps, columns, repair_clock))
-        return clock_accepted(recording) if repair_clock else recording
+        recording = clock_accepted(recording) if repair_clock else recording
+        if not is_bag:  # all that the vehicle changes in other logs is the sigma of fixes without one
+            held.append((receiver, recording))
+        return recording
 
-    first = open_log(generic_rig())
-    print_lines(contents_lines(first))
-    answers = ask(answers, topics)
-    with progress_bar("calibrating the sensors") as progress:
-        found = first_vehicle(open_log, first, answers, progress)
+    with decoded_once():
+        topics = choose_sensors(log, parse_topics(topic))
+        first = open_log(generic_rig())
+        print_lines(contents_lines(first))
+        answers = ask(answers, topics)
+        with progress_bar("calibrating the sensors") as progress:
+            found = first_vehicle(open_log, first, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
     lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]

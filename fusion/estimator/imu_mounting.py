@@ -1,13 +1,17 @@
-"""An IMU turned about its vertical axis: learned while the wheels roll, corrected where it is clear."""
+"""An IMU turned about its vertical axis: learned while the wheels roll, corrected where it is clear.
+
+One that is tilted is turned by the angles of the vehicle file.
+"""
 
 from __future__ import annotations
 
 import math
 
+import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, LEAST_SIGMA_RAD, Angle, MountingAngle
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.skid import SkidDetector
@@ -21,6 +25,12 @@ accelerations hides; it ends at half of both (assumed)."""
 
 DOUBTFUL_TILT_RAD, DOUBTFUL_MPS = 0.1, 0.3
 """1 sigma of tilt and speed after driving with turned accelerations (assumed)."""
+
+
+def level_rotation(known: SensorNumbers) -> Array | None:
+    """Rotation (3, 3) of the readings of a tilted IMU into body axes, but for yaw; None for a level one."""
+    roll, pitch = (0.0 if one is None else one.number for one in (known.imu_roll_rad, known.imu_pitch_rad))
+    return None if roll == pitch == 0.0 else np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix())
 
 
 class ImuMounting:
@@ -39,6 +49,7 @@ class ImuMounting:
         self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
         self.corrects = False
         self.start_from(_prior(config.rig.known.imu_yaw_rad))
+        imu.level = level_rotation(config.rig.known) if config.inputs.imu == "six_axis" else None
 
     def start_from(self, before: Angle) -> None:
         """Begin with what is known of the robot."""

@@ -1,6 +1,6 @@
 """A vehicle file for a robot that the library has never seen, from one log of it.
 
-    open the log -> geometry -> mounting of the IMU -> calibrate its sensors -> lines of the file
+    open the log -> geometry -> mounting and tilt of the IMU -> calibrate its sensors -> lines of the file
 
 Each step opens or replays the log with the file as it is by then, so that what is written is what was used.
 """
@@ -22,6 +22,7 @@ from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
 from terrafusion.fusion.init.geometry import geometry_lines, radius_line
+from terrafusion.fusion.init.level import measure_tilt, tilt_lines
 from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
 from terrafusion.twin.model.library import is_named
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
@@ -106,7 +107,8 @@ def first_vehicle(
         if mounted.turned:  # what is measured about z holds only now
             tail = mounted.axes | tail
             measured, geometry = _geometry(mounted.recording, answers, base, rig)
-        draft = head | geometry | tail
+        tilted, tilt_notes = tilt_lines(measure_tilt(mounted.recording, base), mounted.recording.name)
+        draft = head | geometry | tail | tilted
         calibration, notes = _calibrated(mounted.recording, write_draft(file, draft, "draft"), progress)
         findings = mounted.findings
         if calibration is not None:
@@ -116,6 +118,7 @@ def first_vehicle(
     if base.name != "generic":
         known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
         notes = (known, *notes)
+    notes = (*tilt_notes, *notes)
     return FirstVehicle(draft, mounted.recording, mounted.repaired, findings, measured, calibration, notes)
 
 

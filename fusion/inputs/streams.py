@@ -148,7 +148,8 @@ class ImuStream:
     place the readings of a robot that drives straight on level ground.
 
     `turn_scale` is the true over the measured yaw rate, less one, and `mounting_rad` the angle about z at
-    which the IMU is mounted; `segments` and `levelled` correct them.
+    which the IMU is mounted; `segments` and `levelled` correct them. `level` (3, 3) turns the samples of a
+    tilted IMU as they come.
 
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
@@ -157,6 +158,7 @@ class ImuStream:
     def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
         self.six_axis = six_axis
         self.turn_scale = self.mounting_rad = 0.0
+        self.level: Array | None = None
         self.spikes = self.impossible = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
@@ -187,6 +189,8 @@ class ImuStream:
         if beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2):
             self.impossible += 1
             return
+        if self.level is not None:
+            gyro, accel = self.level @ gyro, self.level @ accel
         for sample in self.late.leap.admitted((t_ns, gyro, accel)):
             self._insert(*sample)
 

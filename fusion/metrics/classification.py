@@ -1,10 +1,9 @@
-"""Scores of a classifier's probabilities, by scikit-learn; only the calibration error is computed here."""
+"""Scores of a classifier's probabilities."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,14 +38,15 @@ def classification_scores(
     classes: Sequence[str], true: NDArray[np.intp], winner: NDArray[np.intp], confidence: Array
 ) -> ClassificationScores:
     """Scores of n windows: indices (n,) of true and most probable class, and its probability (n,)."""
-    from sklearn.metrics import accuracy_score, confusion_matrix, f1_score
-
-    every: list[int] = list(range(len(classes)))
-    shares: NDArray[Any] = confusion_matrix(true, winner, labels=every, normalize="true")
+    k = len(classes)
+    counts = np.bincount(true * k + winner, minlength=k * k).reshape(k, k)
+    hits, of_class = np.diag(counts), counts.sum(axis=1)
+    f1 = 2.0 * hits / np.maximum(of_class + counts.sum(axis=0), 1)
+    shares = counts / np.maximum(of_class, 1)[:, None]
     return ClassificationScores(
         classes=tuple(classes),
-        macro_f1=float(f1_score(true, winner, labels=np.unique(true), average="macro", zero_division=0.0)),
-        accuracy=float(accuracy_score(true, winner)),
+        macro_f1=float(f1[of_class > 0].mean()),
+        accuracy=float((true == winner).mean()),
         ece=calibration_error(confidence, winner == true),
         confusion=tuple(tuple(row) for row in shares.tolist()),
         windows=len(true),
@@ -54,7 +54,7 @@ def classification_scores(
 
 
 def calibration_error(confidence: Array, correct: NDArray[np.bool_]) -> float:
-    """Expected calibration error (Naeini et al. 2015) of probabilities (n,); scikit-learn has none."""
+    """Expected calibration error (Naeini et al. 2015) of probabilities (n,)."""
     bins = np.minimum((confidence * ECE_BINS).astype(int), ECE_BINS - 1)
     gap = np.bincount(bins, weights=confidence - correct, minlength=ECE_BINS)
     return float(np.abs(gap).sum() / len(confidence))

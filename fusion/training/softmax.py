@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
@@ -181,9 +181,14 @@ def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFA
 
     Raises:
         ConfigError: fewer than two classes.
+        TerrafusionError: scikit-learn is not installed.
     """
-    from sklearn.linear_model import LogisticRegression
-
+    try:
+        from sklearn.linear_model import LogisticRegression
+    except ImportError:
+        raise TerrafusionError(
+            "the package scikit-learn is not installed", remedy="pip install 'terrafusion[learn]'"
+        ) from None
     used = np.isin(SURFACE_FEATURES, list(features))
     x = np.where(used & np.isfinite(x), x, np.nan)
     classes, y = np.unique(np.asarray(labels, dtype=str), return_inverse=True)

@@ -12,6 +12,7 @@ from terrafusion.datasets.readers.formats import Request, format_of
 from terrafusion.datasets.readers.open import find_log
 from terrafusion.datasets.readers.ros import ros1, ros2
 from terrafusion.datasets.readers.ros.bag import chosen_topics, opened_bag, topics_of
+from terrafusion.datasets.readers.ros.messages import wanted_fields
 from terrafusion.datasets.readers.ros.streams import read_streams
 from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
@@ -37,6 +38,13 @@ class BagContents:
     rivals: dict[str, tuple[str, ...]]
 
 
+def _fields_of(topic: BagTopic) -> tuple[str, ...]:
+    """The stamp, and all that any channel is made of: so a bag that is `decoded_once` is read once."""
+    kinds = [kind for kind, types in TYPES.items() if topic.msgtype in types]
+    wanted = [wanted_fields(kind, topic.msgtype) for kind in kinds]
+    return ("header.stamp", *dict.fromkeys(f for fields in wanted for f in fields)) if all(wanted) else ()
+
+
 def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagContents | None:
     """Contents of a bag; None for a log of another format.
 
@@ -60,9 +68,9 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
     doors = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
     with opened_bag(path, *doors[form]) as container:
         there = topics_of(container)
-        chosen_topics(container, Request(path, topics=topics), open_to_the_user)
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
-        streams = read_streams(container, {(t.name, t.msgtype): ("header.stamp",) for t in usable})
+        streams = read_streams(container, {(t.name, t.msgtype): _fields_of(t) for t in usable})
+        chosen_topics(container, Request(path, topics=topics), open_to_the_user)
     contents = []
     for topic in usable:
         stream = streams[topic.name, topic.msgtype]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 
 import numpy as np
@@ -16,6 +17,11 @@ from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, BagSour
 Key = tuple[str, str]
 """Name and type of a topic."""
 _RULE = "=" * 80 + "\n"
+Held = tuple[tuple[str, ...], Stream]
+"""Fields, () for all, and the stream that has them."""
+_DECODED: ContextVar[dict[tuple[tuple[BagSource, ...], Key], Held] | None]
+_DECODED = ContextVar("streams decoded once", default=None)
+"""By bag, known by its sources, and topic."""
 
 
 @contextmanager
@@ -29,7 +35,38 @@ def foreign(topic: str | None = None) -> Iterator[None]:
         raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
 
 
+@contextmanager
+def decoded_once() -> Iterator[None]:
+    """Within it the fields of a topic are decoded once, however often its bag is opened."""
+    token = _DECODED.set({})
+    try:
+        yield
+    finally:
+        _DECODED.reset(token)
+
+
 def read_streams(
+    container: BagContainer, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
+) -> dict[Key, Stream]:
+    """As `decode_streams`, which is not called for what is held `decoded_once`."""
+    held = _DECODED.get()
+    if held is None:
+        return decode_streams(container, asked, enough)
+    bag = tuple(container.sources)
+    missing = {key: fields for key, fields in asked.items() if not _holds(held.get((bag, key)), fields)}
+    if missing and enough is not None:
+        return decode_streams(container, asked, enough)
+    for key, stream in decode_streams(container, missing).items() if missing else ():
+        held[bag, key] = (missing[key], stream)
+    return {key: held[bag, key][1] for key in asked}
+
+
+def _holds(held: Held | None, fields: tuple[str, ...]) -> bool:
+    """Whether these fields, () for all, are among those decoded."""
+    return held is not None and (not held[0] or (bool(fields) and set(fields) <= set(held[0])))
+
+
+def decode_streams(
     container: BagContainer, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
 ) -> dict[Key, Stream]:
     """The streams of topics, in one go over the file.

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -16,6 +17,7 @@ from typer.testing import CliRunner, Result
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.ros import streams
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -200,6 +202,20 @@ def test_a_field_log_of_a_robot_by_another_name(tmp_path: Path) -> None:
     assert robot["wheel_scale"]["known"] == "calibrated"
     assert robot["track_m"] == {"value": 0.55, "known": "assumed"}
     assert "verdict: good" in done.output
+
+
+def test_a_bag_is_decoded_once(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[str] = []
+
+    def counted(container: Any, asked: dict[Any, Any], enough: int | None = None) -> Any:
+        decoded.extend(topic for topic, _ in asked)
+        return decode(container, asked, enough)
+
+    decode = streams.decode_streams
+    monkeypatch.setattr(streams, "decode_streams", counted)
+    done = run(bag, "--out", tmp_path / "rover.yaml", "--topic", "imu=/rover/front/imu", "--no-verdict")
+    assert done.exit_code == 0, done.output
+    assert len(decoded) == len(set(decoded)) >= 4
 
 
 def test_the_user_is_asked_on_a_terminal(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,74 @@
+"""The tilt of an IMU: found over all headings, told from a slope, and taken out by the estimator."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.init.draft import write_draft
+from terrafusion.fusion.init.level import measure_tilt, tilt_lines
+from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.replay import replay
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
+
+ROLL, PITCH = math.radians(-6.0), math.radians(11.0)
+BASE = load_vehicle("elevate")
+
+
+def tilted(recording: Recording) -> Recording:
+    """The recording of an IMU that is mounted rolled and pitched."""
+    imu = recording.imu
+    assert imu is not None
+    R = gtsam.Rot3.RzRyRx(ROLL, PITCH, 0.0).matrix()  # turns its readings into body axes
+    turned = dataclasses.replace(imu, gyro_radps=imu.gyro_radps @ R, accel_mps2=imu.accel_mps2 @ R)
+    return dataclasses.replace(recording, imu=turned)
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return simulate("figure_eight", terrain="asphalt", seed=3)
+
+
+def test_a_tilt_is_found_within_its_sigma_and_taken_out(drive: Recording, tmp_path: Path) -> None:
+    log = tilted(drive)
+    tilt = measure_tilt(log, BASE)
+    assert tilt is not None
+    assert abs(tilt.roll_rad - ROLL) < 2.0 * tilt.sigma_rad
+    assert abs(tilt.pitch_rad - PITCH) < 2.0 * tilt.sigma_rad
+    lines, notes = tilt_lines(tilt, "log")
+    assert set(lines) == {"imu_roll_rad", "imu_pitch_rad"}
+    assert not notes
+    head = {"extends": dataclasses.replace(lines["imu_roll_rad"], value="elevate")}
+    file = write_draft(tmp_path / "robot.yaml", head | lines, "tilted")
+    outages = [Outage(50.0, 25.0)]
+    with_file, without = (replay(log, vehicle=v, outages=outages).scores for v in (file, "elevate"))
+    assert with_file.ate_m is not None
+    assert without.ate_m is not None
+    assert with_file.ate_m < 0.3 * without.ate_m
+
+
+def test_a_slope_is_no_tilt(drive: Recording) -> None:
+    sloping = simulate("figure_eight", terrain="asphalt", seed=3, slope_deg=8.0)
+    for log in (drive, sloping):
+        assert tilt_lines(measure_tilt(log, BASE), "log") == ({}, ())
+
+
+def test_a_straight_drive_up_a_slope_gets_a_remedy_and_no_number() -> None:
+    uphill = simulate("straight", terrain="asphalt", seed=3, slope_deg=8.0)
+    lines, (note,) = tilt_lines(measure_tilt(uphill, BASE), "log")
+    assert not lines
+    assert "a slope, or a tilted mount; drive once round on level ground" in note
+
+
+def test_without_six_axes_nothing_is_measured(drive: Recording) -> None:
+    assert drive.imu is not None
+    flat = dataclasses.replace(drive.imu, accel_mps2=np.full_like(drive.imu.accel_mps2, np.nan))
+    assert measure_tilt(dataclasses.replace(drive, imu=flat), BASE) is None
+    assert measure_tilt(dataclasses.replace(drive, wheels=None), BASE) is None
