@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from terrafusion.datasets.core.tables import text_table
@@ -85,6 +84,8 @@ def demo(
 
 def _replayed(recording: Recording | None, seed: int, mode: str) -> tuple[DemoRun, ReplayResult | None]:
     """A replay of `recording`, with its details, or of a drive simulated here, without."""
+    import numpy as np
+
     from terrafusion.fusion.estimator.estimator import Estimator
     from terrafusion.fusion.metrics.scores import Outage
     from terrafusion.fusion.replay import replay
@@ -92,7 +93,7 @@ def _replayed(recording: Recording | None, seed: int, mode: str) -> tuple[DemoRu
     from terrafusion.twin.simulate import simulate
 
     log = simulate("demo", seed=seed) if recording is None else recording
-    odom: list[np.ndarray] = []
+    odom: list[Any] = []
 
     def watch(estimator: Estimator) -> None:
         state = estimator.odometry("odom")
