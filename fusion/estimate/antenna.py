@@ -1,4 +1,4 @@
-"""Where the antenna was taken to be, over a drive in which the estimator learned it."""
+"""Where the antenna was taken to be over a drive in which the estimator learned it; lateness of its fixes."""
 
 from __future__ import annotations
 
@@ -6,30 +6,43 @@ import bisect
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 
 
 @dataclass(frozen=True)
 class AntennaPlaces:
-    """Lever arms (3,) m, body axes, each from its time on; the first holds before, too."""
+    """Lever arms (3,) m, body axes, and lateness of the fixes' stamps, ns, each from its time on; the first
+    holds before, too.
+    """
 
     since_ns: tuple[int, ...]
     lever_m: tuple[tuple[float, ...], ...]
+    late_ns: tuple[int, ...] = (0,)
 
     @classmethod
     def fixed(cls, lever_m: tuple[float, ...]) -> AntennaPlaces:
         """One place for the whole drive."""
         return cls((0,), (lever_m,))
 
-    def then(self, t_ns: int, lever_m: tuple[float, ...]) -> AntennaPlaces:
-        """The same with another place from `t_ns` on."""
-        if lever_m == self.lever_m[-1]:
+    def then(self, t_ns: int, lever_m: tuple[float, ...], late_ns: int = 0) -> AntennaPlaces:
+        """The same with another place and lateness from `t_ns` on."""
+        if lever_m == self.lever_m[-1] and late_ns == self.late_ns[-1]:
             return self
-        known = bisect.bisect_left(self.since_ns, t_ns)
-        return AntennaPlaces((*self.since_ns[:known], t_ns), (*self.lever_m[:known], lever_m))
+        n = bisect.bisect_left(self.since_ns, t_ns)
+        return AntennaPlaces(
+            (*self.since_ns[:n], t_ns), (*self.lever_m[:n], lever_m), (*self.late_ns[:n], late_ns)
+        )
 
     def at(self, t_ns: TimesNs) -> Array:
         """Lever arms (N, 3) at the times (N,)."""
-        row = np.searchsorted(np.array(self.since_ns), t_ns, side="right") - 1
-        return np.array(self.lever_m, dtype=float)[np.maximum(row, 0)]
+        return np.array(self.lever_m, dtype=float)[self._rows(t_ns)]
+
+    def measured_ns(self, stamp_ns: TimesNs) -> TimesNs:
+        """When fixes with the stamps (N,) were measured."""
+        return stamp_ns - np.array(self.late_ns, dtype=np.int64)[self._rows(stamp_ns)]
+
+    def _rows(self, t_ns: TimesNs) -> NDArray[np.int64]:
+        found = np.searchsorted(np.array(self.since_ns), t_ns, side="right")
+        return np.maximum(found.astype(np.int64) - 1, 0)

@@ -29,7 +29,6 @@ from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_vel
 from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
-from terrafusion.twin.sensors.gnss import best_fix
 
 LEAST_SIGMA_M = 0.005
 KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
@@ -92,7 +91,6 @@ class GnssUpdater:
         self.skid = skid or SkidDetector()
         self.scale, self.white, self._handled = 1.0, WHITE_SHARE, 1.0
         self.sheet_sigma_m = spec.sigma_horizontal_m
-        self._best = best_fix(spec)
         self._class: Fix | None = None
         self._class_scale: dict[Fix | None, float] = {}
         imu = config.rig.sensors.imu
@@ -134,7 +132,8 @@ class GnssUpdater:
     def correct(self, t_ns: int, antenna_m: Array, delay_s: float) -> None:
         """Correct the lever arm, body x and y (2,), from `t_ns` on, and the lateness of the stamps."""
         self.antenna_m = self.nominal_antenna_m + np.append(antenna_m, 0.0)
-        self.antenna_places = self.antenna_places.then(t_ns, tuple(self.antenna_m.tolist()))
+        late_ns = round(delay_s * 1e9)
+        self.antenna_places = self.antenna_places.then(t_ns, tuple(self.antenna_m.tolist()), late_ns)
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
         self.delay_s = delay_s
 
@@ -264,14 +263,12 @@ class GnssUpdater:
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Restart the drift where the class of fix changes; True when it does.
 
-        A worse class than the data sheet's drifts in proportion to what its first fix reports.
+        A receiver whose first fix of a class reports more than the data sheet drifts in proportion.
         """
         if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
             return False
         self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
-        worse = fix.fix is not None and fix.fix < self._best
-        reported_m = float(np.max(fix.sigma_m[:2]))
-        self._class_scale[fix.fix] = max(1.0, reported_m / self.sheet_sigma_m) if worse else 1.0
+        self._class_scale[fix.fix] = max(1.0, float(np.max(fix.sigma_m[:2])) / self.sheet_sigma_m)
         step = chain.nodes[k - chain.first].markov
         if first or step is None:
             return False

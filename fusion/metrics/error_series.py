@@ -124,9 +124,16 @@ def errors_against_truth(
 def errors_against_fixes(
     estimate: Estimate, held_out: Gnss | None, antenna_m: Lever = (0.0, 0.0, 0.0)
 ) -> Errors | None:
-    """The error series of the antenna against GNSS fixes, or None if no fix lies within the estimate."""
+    """The error series of the antenna against GNSS fixes, or None if no fix lies within the estimate.
+
+    A late fix is compared with the estimate at the time when it was measured, as far as the estimator has
+    learned how late it is.
+    """
     if held_out is None or len(estimate.trajectory) < 2:
         return None
+    places = antenna_m if isinstance(antenna_m, AntennaPlaces) else AntennaPlaces.fixed(antenna_m)
+    measured_ns = np.maximum.accumulate(places.measured_ns(held_out.t_ns))
+    held_out = dataclasses.replace(held_out, t_ns=measured_ns)
     valid = np.isfinite(held_out.enu_m[:, :2]).all(axis=1) & (held_out.fix != Fix.NONE)
     grid = estimate.trajectory.t_ns
     inside = (held_out.t_ns >= grid[0]) & (held_out.t_ns <= grid[-1])

@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from terrafusion.fusion.calibration.numbers import NUMBERS, TURN_SCALE, Knowledge
+from terrafusion.fusion.calibration.numbers import GNSS_DELAY, NUMBERS, TURN_SCALE, Knowledge
+from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import TURN_TIME_S, with_turn_doubt
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
@@ -49,3 +50,14 @@ def test_there_is_no_doubt_at_a_fix_or_on_a_straight() -> None:
 
 def test_the_doubt_is_bounded_where_no_fix_was_used() -> None:
     assert added_density(math.inf) == pytest.approx(SCALE_SIGMA * RATE_RADPS * math.sqrt(TURN_TIME_S))
+
+
+@pytest.mark.parametrize(("sigma_s", "corrected_s"), [(0.1, 0.0), (0.07, 0.4)])
+def test_a_delay_corrects_from_five_of_its_sigmas_on(sigma_s: float, corrected_s: float) -> None:
+    """Wheels that slip while speed changes look like late fixes, and few sigmas do not tell them apart."""
+    estimator = Estimator.for_vehicle("elevate", "fixed")
+    prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
+    mean, sigma = prior.mean.copy(), prior.sigma
+    mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.4, sigma_s
+    estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03), 1)
+    assert estimator.gnss.delay_s == pytest.approx(corrected_s)

@@ -13,3 +13,8 @@ def test_places_of_the_antenna_follow_each_other() -> None:
     both = first.then(200, (2.0, 0.0, 0.0))
     assert both.at(np.array([-5, 99, 100, 199, 200, 300]))[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
     assert both.then(100, (3.0, 0.0, 0.0)).at(np.array([250]))[0, 0] == 3.0, "a later thought replaces"
+
+
+def test_late_stamps_are_those_of_earlier_measurements() -> None:
+    places = AntennaPlaces.fixed((0.0, 0.0, 0.0)).then(100, (0.0, 0.0, 0.0), 30)
+    assert places.measured_ns(np.array([50, 99, 100, 150])).tolist() == [50, 99, 70, 120]

@@ -273,6 +273,21 @@ def test_an_antenna_learned_on_the_way_is_where_it_was_taken_to_be(drive):
         assert s.held_out.p95_m == pytest.approx(expected, abs=1e-9)
 
 
+def test_late_fixes_are_compared_with_the_estimate_when_they_were_measured(drive):
+    """At 1 m/s half a second is half a metre, unless the estimator has learned it."""
+    d = drive(turn_radps=0.0)
+    late_ns = 500_000_000
+    late = dataclasses.replace(d.fixes, t_ns=d.fixes.t_ns + late_ns)
+    plain = AntennaPlaces.fixed((0.0, 0.0, 0.3))
+    learned = dataclasses.replace(plain, late_ns=(late_ns,))
+    unknown, known = (
+        score(d.estimate, without_truth(d.recording), held_out=late, antenna_m=places).held_out
+        for places in (plain, learned)
+    )
+    assert unknown.median_m > 0.2
+    assert known.p95_m == pytest.approx(0.0, abs=1e-9)
+
+
 def test_truth_of_the_antenna_is_compared_at_the_antenna(drive):
     d = drive()
     lever = (0.3, -0.2, 0.35)
