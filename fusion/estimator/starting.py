@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 import numpy as np
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -21,9 +24,9 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
 """Without a fix for so long the start no longer waits for a better heading, where there is one that tells
 forward from sideways (45 deg; assumed)."""
-MANY_FIXES, ROUGHEST_YAW_RAD = 10, 1.6
-"""From so many fixes on their scatter, and with it the sigma of the heading, is known well enough that one
-that tells forward from backward will do (90 deg; assumed)."""
+MANY_FIXES, UNKNOWN_YAW_RAD = 10, math.pi / math.sqrt(3.0)
+"""From so many fixes on the position is known, and any heading will do, with the sigma that it has: at most
+that of one of which nothing is known, uniform over the circle (assumed)."""
 
 
 class StartSearch:
@@ -68,10 +71,10 @@ class StartSearch:
             if drop_before_start(imu, wheels, fixes):
                 self.level = self._rough = None
         elif fixes and (last or imu.t_ns[-1] - fixes[-1].t_ns > SILENT_NS):
-            roughest = ROUGH_YAW_RAD if len(fixes) < MANY_FIXES else ROUGHEST_YAW_RAD
-            if self._rough is not None and self._rough.yaw_sigma_rad <= roughest:
+            rough = self._rough
+            if rough is not None and (len(fixes) >= MANY_FIXES or rough.yaw_sigma_rad <= ROUGH_YAW_RAD):
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
-                return self._rough
+                return dataclasses.replace(rough, yaw_sigma_rad=min(rough.yaw_sigma_rad, UNKNOWN_YAW_RAD))
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
             self._gnss.local = True
             return self.level

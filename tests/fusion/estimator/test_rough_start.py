@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.replay import replay
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
 SIGMA_M = 1.0
@@ -17,14 +18,20 @@ USUAL_YAW_SIGMA_RAD = 0.12
 """As good as the heading of a start otherwise is."""
 
 
-def with_few_fixes(seconds: float, seed: int) -> Recording:
-    """A drive with fixes once a second, a metre off and without velocity, that end after `seconds`."""
-    run = simulate("figure_eight", terrain="asphalt", seed=1)
+def with_few_fixes(
+    seconds: float,
+    seed: int,
+    drive: Scenario | str = "figure_eight",
+    sigma_m: float = SIGMA_M,
+    vehicle: str = "elevate",
+) -> Recording:
+    """A drive with fixes once a second, metres off and without velocity, that end after `seconds`."""
+    run = simulate(drive, terrain="asphalt", seed=1, vehicle=vehicle)
     assert run.gnss is not None
     t_s = (run.gnss.t_ns - run.start_ns) * 1e-9
     gnss = run.gnss.select((np.arange(len(t_s)) % 5 == 0) & (t_s < seconds))
-    off = SIGMA_M * np.random.default_rng(seed).normal(size=gnss.enu_m.shape)
-    sigma = np.full(gnss.enu_m.shape, SIGMA_M)
+    off = sigma_m * np.random.default_rng(seed).normal(size=gnss.enu_m.shape)
+    sigma = np.full(gnss.enu_m.shape, sigma_m)
     enu_m = gnss.enu_m + off
     plain = dataclasses.replace(gnss, enu_m=enu_m, sigma_enu_m=sigma, velocity_enu_mps=None, sigma_v_mps=None)
     return dataclasses.replace(run, gnss=plain)
@@ -32,6 +39,18 @@ def with_few_fixes(seconds: float, seed: int) -> Recording:
 
 def test_fixes_that_end_before_the_heading_is_good_still_give_a_start() -> None:
     found = replay(with_few_fixes(9.0, 0), mode="fixed")
+    path, errors = found.estimate.trajectory, found.scores.errors
+    assert path.covariance is not None
+    assert errors is not None
+    assert float(np.sqrt(path.covariance[0, 5, 5])) > USUAL_YAW_SIGMA_RAD
+    assert float(np.nanmedian(2.0 * errors.nees())) < 5.991
+
+
+def test_many_fixes_start_with_an_unknown_heading_where_they_show_none() -> None:
+    """They tell where the robot is, and how far it can have driven since."""
+    circles = (DriveSegment(40.0, v_mps=0.3, yaw_rate_radps=1.0),)
+    circling = Scenario("circling", 40.0, drive=circles, route=(RouteLeg("asphalt"),))
+    found = replay(with_few_fixes(30.0, 0, circling, 4.0, "husky"), mode="fixed")
     path, errors = found.estimate.trajectory, found.scores.errors
     assert path.covariance is not None
     assert errors is not None
