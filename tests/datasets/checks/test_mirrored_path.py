@@ -1,0 +1,68 @@
+"""East and north swapped where fixes are too coarse for courses."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+
+RIG = load_vehicle("elevate").rig()
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Recording:
+    """Two bends, 20 m, with fixes of 2 m that drift."""
+    legs = (DriveSegment(3.0), DriveSegment(12.0, 0.8, 0.12), DriveSegment(12.0, 0.8, -0.02))
+    scenario = Scenario("bend", 27.0, drive=legs, route=(RouteLeg("asphalt"),))
+    return with_fixes(simulate(scenario, seed=2), 0.3)
+
+
+def with_fixes(log: Recording, noise_m: float) -> Recording:
+    """Fixes that report 2 m."""
+    gnss = log.gnss
+    assert gnss is not None
+    noise = np.random.default_rng(1).normal(0.0, noise_m, gnss.enu_m.shape)
+    sigma = np.full_like(gnss.sigma_enu_m, 2.0)
+    coarse = dataclasses.replace(gnss, enu_m=gnss.enu_m + noise, sigma_enu_m=sigma, velocity_enu_mps=None)
+    return dataclasses.replace(log, gnss=coarse)
+
+
+def swapped(log: Recording) -> Recording:
+    gnss = log.gnss
+    assert gnss is not None
+    return dataclasses.replace(log, gnss=dataclasses.replace(gnss, enu_m=gnss.enu_m[:, [1, 0, 2]]))
+
+
+def codes(log: Recording) -> set[str]:
+    return {finding.code for finding in run_checks(log, RIG)}
+
+
+def test_swapped_axes_of_coarse_fixes_are_found_and_mended(coarse: Recording) -> None:
+    assert "gnss-course" not in codes(coarse)
+    assert "gnss-course" in codes(swapped(coarse))
+    mended, _ = repair(swapped(coarse), RIG)
+    assert mended.gnss is not None
+    assert coarse.gnss is not None
+    np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
+
+
+def test_a_straight_path_or_wild_fixes_show_no_image(coarse: Recording) -> None:
+    straight = Scenario("line", 27.0, drive=(DriveSegment(27.0, 0.8),), route=(RouteLeg("asphalt"),))
+    assert "gnss-course" not in codes(swapped(with_fixes(simulate(straight, seed=2), 0.3)))
+    assert "gnss-course" not in codes(swapped(with_fixes(coarse, 3.0)))
+
+
+def test_a_gyro_of_the_wrong_sign_is_not_put_down_to_the_fixes(coarse: Recording) -> None:
+    imu = coarse.imu
+    assert imu is not None
+    turned = dataclasses.replace(imu, gyro_radps=imu.gyro_radps * [1.0, 1.0, -1.0])
+    found = codes(dataclasses.replace(coarse, imu=turned))
+    assert "gnss-course" not in found
+    assert "yaw-sign" in found
