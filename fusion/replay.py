@@ -145,7 +145,8 @@ def replay(
         aligned=estimator.gnss.local,
     )
     found = run_checks(recording, config.rig) if findings is None else findings
-    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig))
+    delay_s = estimator.learned.uncorrected_delay_s()
+    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig, delay_s))
     return ReplayResult(
         recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), run.seconds,
         run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,

@@ -54,9 +54,8 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
         except CallbackError as passed:
             raise passed.error from None
         except BREAKDOWN:
-            count = estimator.breakdowns + 1
-            estimator.__init__(estimator.config, estimator._on_state, estimator._on_innovation)
-            estimator.breakdowns = count
+            estimator.breakdowns += 1
+            estimator.reset()
             raise DataError(
                 "the sensors contradict each other so far that no state fits them; the estimator starts anew",
                 remedy="check units, axes and vehicle file with `terrafusion inspect`",

@@ -96,28 +96,31 @@ class Estimator:
         archive: Chain | None = None,
     ) -> None:
         rig, policy = config.inputs.rig(config.rig), policy_of(config.rig, config.policy)
-        self.config = config = dataclasses.replace(config, rig=rig, policy=policy)
+        self.config = dataclasses.replace(config, rig=rig, policy=policy)
+        self._on_state, self._on_innovation, self.breakdowns = on_state, on_innovation, 0
+        self.reset(archive)
+
+    def reset(self, archive: Chain | None = None) -> None:
+        """Back to before the first sample; configuration and callbacks stay."""
+        config, rig = self.config, self.config.rig
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
-        self.wheels = WheelStream(self.newest)
-        self.gyro = StuckGyro(config.rig, config.inputs)
-        self.steering = SteeringStream(rig, self.newest)
+        self.wheels, self.steering = WheelStream(self.newest), SteeringStream(rig, self.newest)
+        self.gyro = StuckGyro(rig, config.inputs)
         self._turn, self.weights = steered_turn(rig, config.inputs), TerrainNoise(config)
-        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
+        self._preintegrator = config.inputs.preintegrator(rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
-        self._on_state, self._on_innovation = on_state, on_innovation
         self._wheel_gate, self._jitter = WheelGate(config.wheel_gate_sigma), WheelJitter()
+        self._silent, self.wheels_rejected = False, 0
         self._search = StartSearch(config, self.aids, self.gnss)
         self._set_step(config.keyframe_s)
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
-        self._silent, self.wheels_rejected, self.breakdowns = False, 0, 0
-        self._stationarity = StationarityDetector(config.rig)
-        self.monitor = MotionMonitor(config.rig)
+        self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
         self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
 
@@ -300,9 +303,8 @@ class Estimator:
         self._upkeep()
         self.gyro.doubt_heading(self.chain)
         switch = self.weights.take_switch()
-        before_ns = self.chain.nodes[-1].t_ns
+        before_ns, before = self.chain.nodes[-1].t_ns, self.chain.state(self.chain.last)
         dt = (t_ns - before_ns) * 1e-9
-        before = self.chain.state(self.chain.last)
         noise, drift = self.weights.noise, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
         if switch > SWITCHED:
             slow_states.inflate_slip_covariance(self.chain, t_ns - SEEN_LATE_NS, dt, noise, *drift, switch)
@@ -384,9 +386,8 @@ class Estimator:
         travelled = self.wheels.travelled(before_ns, t_ns)
         if travelled is None:
             return None
-        rig, inputs = self.config.rig, self.config.inputs
+        rig, inputs, bias_z = self.config.rig, self.config.inputs, float(before.bias.gyroscope()[2])
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
-        bias_z = float(before.bias.gyroscope()[2])
         change = self.wheels.speed_change_mps(before_ns, t_ns)
         noise, surging = self.weights.noise, self.config.calibrate
         increment = wheel_increment(

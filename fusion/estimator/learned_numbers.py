@@ -160,6 +160,13 @@ class LearnedNumbers:
             numbers.append(NumberAfterDrive("imu_yaw_rad", angle.rad, *sigmas, self.mounting.corrects))
         return tuple(numbers)
 
+    def uncorrected_delay_s(self) -> tuple[float, float] | None:
+        """Lateness of the fixes beyond what was known, 1 sigma; None where corrected or not learned."""
+        if self.calibration is None or self._clear[CORRECTED.index(GNSS_DELAY)]:
+            return None
+        delay_s = self._known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY]
+        return float(delay_s), float(self._known.sigma[GNSS_DELAY])
+
     def _of_fixes(self, prior: Knowledge) -> list[NumberAfterDrive]:
         mean, sigma = self._known.mean.tolist(), self._known.sigma.tolist()
         corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))

@@ -12,6 +12,7 @@ from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import YAW_RATIO, SensorConfig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.door import as_numbers, checked_time
+from terrafusion.fusion.inputs.gyro_unit import GyroUnit
 from terrafusion.fusion.inputs.streams import WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -39,17 +40,23 @@ class StuckGyro:
         self.doubt_rad = 0.0
         self._track_m, self._density = rig.track_m / YAW_RATIO, rig.sensors.imu.gyro_noise_radps_sqrthz
         self._sides = inputs.sides
+        self._unit = GyroUnit(rig.track_m, inputs.sides)
         self._reading = float("nan")
         self._since_ns = 0
         self._count = 0
 
     def checked(self, t_ns: int, gyro_radps: ArrayLike, wheels: WheelStream) -> Array:
-        """A reading (3,), its yaw rate that of the wheels where the gyro is stuck."""
+        """A reading (3,), its yaw rate that of the wheels where the gyro is stuck.
+
+        Raises:
+            DataError: it is no reading, or in deg/s.
+        """
         gyro = as_numbers(gyro_radps, "gyro", "imu")
         t_ns = checked_time(t_ns, "imu")
         if gyro.shape != (3,) or not self._sides:  # the stream refuses the first
             return gyro
         reading = float(gyro[2])
+        self._unit.check(t_ns, reading, wheels)
         if reading != self._reading:
             self._reading, self._since_ns, self._count, self.stuck = reading, t_ns, 0, False
             return gyro

@@ -92,7 +92,8 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
         antenna_m=antenna_m, aligned=local,
     )  # fmt: skip
     found = run_checks(recording, rig)
-    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig))
+    delay_s = estimator.learned.uncorrected_delay_s()
+    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig, delay_s))
 
 
 def run(

@@ -63,7 +63,11 @@ REPORTED = (
     "sigma-too-small", "standing", "saturated",
 )  # fmt: skip
 """Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
-the estimator estimates itself, such as small scale errors and delays, or cost accuracy only."""
+the estimator estimates itself, such as small scale errors and the receiver's delay, or cost accuracy only. It
+does not estimate delays of IMU and wheels: an offset of their clocks counts, too."""
+DELAY_SIGMAS, DELAY_SHARE = 2.5, 5.0
+"""A delay of the fixes is likely from so many of its sigmas on, and matters where the robot moves by so many
+sigmas of the position in it."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class Run:
     used: Gnss | None
     findings: Sequence[Finding]
     rig: Rig
+    delay_s: tuple[float, float] | None = None
+    """Lateness of the fixes as learned, and its 1 sigma, where it was not corrected."""
 
 
 Reason = tuple[str, str]
@@ -303,11 +309,28 @@ def _rejections(run: Run) -> Iterator[Reason]:
 
 def _log(run: Run) -> Iterator[Reason]:
     for finding in run.findings:
-        if finding.severity == "error" or finding.code in REPORTED:
+        clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
+        if finding.severity == "error" or finding.code in REPORTED or clock:
             yield (
                 DOUBTFUL,
                 f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}",
             )
+
+
+def _delayed(run: Run) -> Iterator[Reason]:
+    path = run.estimate.trajectory
+    if run.delay_s is None or path.covariance is None or len(path) < 2:
+        return
+    delay_s, sigma_s = run.delay_s
+    speed = path.path_length_m() / (int(path.t_ns[-1] - path.t_ns[0]) * 1e-9)
+    sigma_m = float(np.sqrt(np.median(path.covariance[:, :2, :2].trace(axis1=1, axis2=2) / 2.0)))
+    if abs(delay_s) > DELAY_SIGMAS * sigma_s and abs(delay_s) * speed > DELAY_SHARE * sigma_m:
+        yield (
+            DOUBTFUL,
+            f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
+            f"{sigma_s:.2f} s), {abs(delay_s) * speed:.2f} m at the mean speed, which sigma does not "
+            "include; give the receiver's delay in the vehicle file, or drive longer",
+        )
 
 
 def _path_ratio(run: Run) -> Iterator[Reason]:
@@ -352,7 +375,7 @@ def _disagreement(run: Run) -> str:
 
 TESTS = (
     _sound, _started, _error, _outages, _five_sigma, _nees, _worse_than_a_baseline, _certain, _innovations,
-    _rejections, _path_ratio, _log, _unchecked,
+    _rejections, _delayed, _path_ratio, _log, _unchecked,
 )  # fmt: skip
 
 

@@ -60,3 +60,16 @@ def test_an_error_of_a_callback_reaches_the_caller(callback: str, error: type[Ex
         add_all(estimator, iter(drive()))
     assert estimator.breakdowns == 0
     assert estimator.latest() is not None
+
+
+def test_a_reset_estimator_is_as_a_new_one_with_its_callbacks() -> None:
+    states: list[int] = []
+    estimator = Estimator(Estimator.for_vehicle("elevate").config, on_state=lambda s: states.append(s.t_ns))
+    add_all(estimator, iter(drive()[:1500]))
+    first, dumped = list(states), estimator.dump()
+    estimator.reset()
+    assert estimator.latest() is None
+    states.clear()
+    add_all(estimator, iter(drive()[:1500]))
+    assert states == first
+    assert estimator.dump() == dumped

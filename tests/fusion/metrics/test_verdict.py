@@ -212,3 +212,28 @@ def test_a_gyro_at_the_end_of_its_range_is_not_good_even_where_nothing_else_show
     run = replay(dataclasses.replace(log, imu=clipped), settings={"self_calibrate": False})
     assert run.verdict.value == "doubtful"
     assert "end of a range" in " ".join(run.verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "value"),
+    [((0.3, 0.05), "doubtful"), ((-0.3, 0.05), "doubtful"), ((0.3, 0.15), "good"), ((0.01, 0.001), "good")],
+)
+def test_a_likely_delay_beyond_the_sigma_of_the_position_is_not_good(drive, delay_s, value):
+    d = drive(noise_m=0.01, sigma_m=0.03)
+    recording = dataclasses.replace(d.recording, truth=None)
+    estimate = consistent(d)
+    run = Run(recording, estimate, score(estimate, recording), Baselines(), d.fixes, (), RIG, delay_s)
+    found = judge(run)
+    assert found.value == value, found
+    assert ("the fixes seem 0.30 s" in found.reasons[0].lower()) == (value == "doubtful")
+
+
+@pytest.mark.parametrize(
+    ("channel", "value"), [("imu", "doubtful"), ("wheels", "doubtful"), ("gnss", "good")]
+)
+def test_a_clock_of_wheels_or_imu_that_is_off_is_not_good(drive, channel, value):
+    d = drive(offset_m=(0.1, 0.1), sigma_m=0.2)
+    late = Finding(
+        "clock-offset", "warning", channel, "its times are 0.29 s late", "correlation 0.96", "move them"
+    )
+    assert verdict(d, estimate=consistent(d), findings=[late]).value == value
