@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.scratch import sweep
+from terrafusion.datasets.core.scratch import machine, sweep
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
@@ -17,7 +17,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     Raises:
         DataError: the folder cannot be made or written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{machine()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent, f".{path.name}.")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import hashlib
 import os
+import platform
 import shutil
 import tempfile
 import time
@@ -14,8 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 PREFIX = ".terrafusion-"
+UNFINISHED = "unfinished"
+"""Only key of the meta.yaml of a log that is being replaced: no reader takes it, a writer knows its log."""
 STALE_S = 3600.0
-"""What is younger may belong to a process on another machine that shares the disk."""
+"""What is younger and not of this machine may belong to a process that runs elsewhere and shares the disk."""
 
 
 @contextmanager
@@ -39,26 +43,40 @@ def process_folder() -> Path:
 def _new_folder(parent: Path | None) -> Path:
     place = Path(tempfile.gettempdir()) if parent is None else parent
     sweep(place, PREFIX)
-    return Path(tempfile.mkdtemp(dir=place, prefix=f"{PREFIX}{os.getpid()}-"))
+    return Path(tempfile.mkdtemp(dir=place, prefix=f"{PREFIX}{os.getpid()}-{machine()}-"))
+
+
+@functools.cache
+def machine() -> str:
+    """What tells the process numbers of this machine, and of this container, from those of others."""
+    known = [platform.node()]
+    with contextlib.suppress(OSError):
+        known += [Path("/proc/sys/kernel/random/boot_id").read_text(), os.readlink("/proc/self/ns/pid")]
+    return hashlib.sha256("".join(known).encode()).hexdigest()[:8]
 
 
 def sweep(folder: Path, prefix: str) -> None:
-    """Remove what killed processes left: entries of `folder` named `prefix`, process id, `-` or `.`, more."""
+    """Remove what killed processes left: entries named `prefix`, process id, `machine()`, more.
+
+    Process id and machine end in `-` or `.`.
+    """
     with contextlib.suppress(OSError):
         for entry in [entry for entry in os.scandir(folder) if entry.name.startswith(prefix)]:
             with contextlib.suppress(OSError, ValueError):
-                number = int(entry.name[len(prefix) :].replace(".", "-").split("-")[0])
-                if _is_left(entry, number):
+                number, place, *_ = entry.name[len(prefix) :].replace(".", "-").split("-")
+                if _is_left(entry, int(number), place == machine()):
                     if entry.is_dir(follow_symlinks=False):
                         shutil.rmtree(entry.path, ignore_errors=True)
                     else:
                         os.unlink(entry.path)
 
 
-def _is_left(entry: os.DirEntry[str], process: int) -> bool:
-    """Whether an entry is ours, old, and of a process that does not run."""
+def _is_left(entry: os.DirEntry[str], process: int, here: bool) -> bool:
+    """Whether an entry is ours and of a process that does not run; old, unless the process was `here`."""
     about = entry.stat(follow_symlinks=False)
-    if time.time() - about.st_mtime < STALE_S or (hasattr(os, "getuid") and about.st_uid != os.getuid()):
+    if hasattr(os, "getuid") and about.st_uid != os.getuid():
+        return False
+    if not here and time.time() - about.st_mtime < STALE_S:
         return False
     try:
         os.kill(process, 0)

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from terrafusion.datasets.core.config import Prepared, structure
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
 from terrafusion.datasets.core.recording import ClockJump, Overrides
+from terrafusion.datasets.core.scratch import UNFINISHED
 from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.yaml_file import read_yaml
 
@@ -122,6 +124,8 @@ def read_meta(path: Path) -> Meta:
 def parse_meta(content: dict[str, Any], path: Path) -> Meta:
     """Check the keys and values of `meta.yaml`; errors as in `read_meta`, about the file `path`."""
     given = {key: value for key, value in content.items() if value is not None}
+    if given.keys() == {UNFINISHED}:
+        raise ConfigError("the log was not written to its end", file=path, remedy="write it again")
     unknown = {key: value for key, value in given.items() if _is_extra(key, given)}
     file = structure(MetaFile, {k: value for k, value in given.items() if k not in unknown}, file=path)
     strange = [shown(name) for name in file.truth_channels or () if name not in TRUTH_CHANNELS]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED, scratch_folder, sweep
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
@@ -55,8 +55,9 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = folder if folder.is_dir() else folder.parent
-        with tempfile.TemporaryDirectory(dir=beside, prefix=".log-") as scratch:
-            whole = Path(scratch) / "log"
+        sweep(folder.parent, PREFIX)
+        with scratch_folder(beside) as scratch:
+            whole = scratch / "log"
             whole.mkdir()
             for name, table in tables.items():
                 _write_table(whole / f"{name}.csv", recording.start_ns, table)
@@ -70,7 +71,8 @@ def _check_room(folder: Path) -> None:
     with writing(folder):
         if folder.exists() and not folder.is_dir():
             raise DataError("is a file", file=folder, remedy="give a folder to write the log into")
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / META).is_file():
+        found = folder.iterdir() if folder.is_dir() else ()
+        if any(not path.name.startswith(PREFIX) for path in found) and not (folder / META).is_file():
             raise DataError(
                 "the folder is not empty and holds no log", file=folder, remedy="give an empty or new folder"
             )
@@ -81,7 +83,8 @@ def _put_in_place(whole: Path, folder: Path) -> None:
     if not folder.exists():
         whole.rename(folder)
         return
-    (folder / META).unlink(missing_ok=True)
+    (whole.parent / META).write_text(f"{UNFINISHED}: true  # by terrafusion\n", encoding="utf-8")
+    os.replace(whole.parent / META, folder / META)
     for name in CHANNELS:
         (folder / f"{name}.csv").unlink(missing_ok=True)
         (folder / f"{name}.csv.gz").unlink(missing_ok=True)

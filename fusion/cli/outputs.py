@@ -10,6 +10,7 @@ from pathlib import Path
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder, expanded
+from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED
 
 ROOT = Path("terrafusion-out")
 LOG_FILES = ("meta.yaml", "*.csv", "*.csv.gz")
@@ -56,7 +57,7 @@ class Output:
         check_folder(out)
         if force or not out.is_dir():
             return
-        found = [path.name for path in sorted(out.iterdir()) if not path.name.endswith(".part")]
+        found = [path.name for path in sorted(out.iterdir()) if not is_part(path.name)]
         foreign = [name for name in found if not any(fnmatch(name, own) for own in self.names)]
         if foreign or (found and not any(self._is_own(out / mark) for mark in self.marks)):
             raise TerrafusionError(
@@ -66,7 +67,9 @@ class Output:
             )
 
     def _is_own(self, path: Path) -> bool:
-        return path.exists() and (path.suffix not in (".json", ".yaml") or holds(path, self.mark))
+        if path.suffix not in (".json", ".yaml"):
+            return path.exists()
+        return holds(path, self.mark) or holds(path, f"{UNFINISHED}: true")
 
 
 def default_name(command: str, subject: str, suffix: str = "") -> Path:
@@ -80,6 +83,11 @@ def default_name(command: str, subject: str, suffix: str = "") -> Path:
         if not path.exists():
             return path
         begun += 1.0
+
+
+def is_part(name: str) -> bool:
+    """Whether an entry is work in progress, or what a killed process left of it."""
+    return name.startswith(PREFIX) or name.endswith(".part")
 
 
 def parts_of(out: Path) -> Path:

@@ -8,7 +8,6 @@ Each step opens or replays the log with the file as it is by then, so that what 
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from terrafusion.datasets.checks.measures import Measures, measure
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
@@ -101,8 +101,8 @@ def first_vehicle(
     head: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
     tail = _messages(recording, answers)
     measured, geometry = _geometry(recording, answers, base, rig)
-    with tempfile.TemporaryDirectory(prefix="terrafusion-") as folder:
-        file = Path(folder) / "vehicle.yaml"
+    with scratch_folder() as folder:
+        file = folder / "vehicle.yaml"
         mounted = _mounted(open_log, head | geometry | tail, file)
         if mounted.turned:  # what is measured about z holds only now
             tail = mounted.axes | tail

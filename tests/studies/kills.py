@@ -55,7 +55,7 @@ axes:
 COMMANDS: dict[str, tuple[str, ...]] = {
     "simulate": ("simulate", "drive.yaml", "--out", "out/run"),
     "simulate to mcap": ("simulate", "drive.yaml", "--out", "out/run.mcap"),
-    "convert": ("convert", "log", "out/log"),
+    "convert": ("convert", "log", "out/log", "--force"),
     "replay": ("replay", "log", "--mode", "fixed", "--out", "out/run"),
     "sweep": ("sweep", "slopes.yaml", "--out", "out/run", "--jobs", "1", "--recordings", "3"),
     "calibrate --sensors": ("calibrate", "log", "--sensors", "--out", "out/robot.yaml"),
@@ -113,7 +113,7 @@ def started(
         for own, stream in zip(streams, (1, 2), strict=True):
             os.dup2(own, stream)
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
-        seen = _watch(kill_event, sign)
+        seen = watched(kill_event, sign)
         if trouble is not None:
             trouble()
         status = _main(words)
@@ -142,7 +142,7 @@ def _main(words: tuple[str, ...]) -> int:
     return 0
 
 
-def _watch(kill_event: int, sign: int) -> list[int]:
+def watched(kill_event: int, sign: int = signal.SIGKILL) -> list[int]:
     """Counts file operations, and ends the process before one of them."""
     seen, own = [0], os.getpid()
 
@@ -199,7 +199,7 @@ def whole(path: Path) -> bool:
     """Whether a file is complete, by its format."""
     data, kind = path.read_bytes(), path.suffix
     if not data:
-        return False
+        return kind == ".jsonl"
     try:
         if path.name.endswith(".csv.gz"):
             data, kind = gzip.decompress(data), ".csv"

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.datasets.core.scratch import PREFIX, scratch_folder
+from terrafusion.datasets.core.scratch import PREFIX, machine, scratch_folder
 
 DEAD = 2**22 + 1  # above the largest process id of Linux
 
@@ -20,10 +20,18 @@ def test_a_scratch_folder_is_private_and_removed(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_process_left_is_swept(tmp_path: Path) -> None:
-    """Kept are what is young, what a running process may use, and files of other names."""
-    left, young, live = (tmp_path / f"{PREFIX}{k}" for k in (f"{DEAD}-a", f"{DEAD}-b", f"{os.getpid()}-c"))
+    """At once where it ran here. Kept are what is young and of another machine, what a running process may
+    use, and files of other names."""
+    names = (
+        f"{DEAD}-a",
+        f"{DEAD}-b",
+        f"{os.getpid()}-c",
+        f"{DEAD}-{machine()}-d",
+        f"{os.getpid()}-{machine()}",
+    )
+    left, young, live, fresh, busy = (tmp_path / f"{PREFIX}{name}" for name in names)
     mine = tmp_path / f"{PREFIX}notes"
-    for folder in (left, young, live, mine):
+    for folder in (left, young, live, fresh, busy, mine):
         folder.mkdir()
         (folder / "x").write_text("x")
     for folder in (left, live, mine):
@@ -31,13 +39,11 @@ def test_what_a_killed_process_left_is_swept(tmp_path: Path) -> None:
     with scratch_folder(tmp_path):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        path.name for path in (young, live, mine)
+        path.name for path in (young, live, busy, mine)
     )
 
 
 def test_a_part_of_a_killed_writer_is_swept(tmp_path: Path) -> None:
-    left = tmp_path / f".a.csv.{DEAD}.part"
-    left.write_text("half")
-    os.utime(left, (0, 0))
+    (tmp_path / f".a.csv.{DEAD}.{machine()}.part").write_text("half")
     write_atomically(tmp_path / "a.csv", lambda part: part.write_text("whole"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
