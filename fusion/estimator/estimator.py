@@ -107,8 +107,8 @@ class Estimator:
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
         self.wheels, self.steering = WheelStream(self.newest), SteeringStream(rig, self.newest)
-        self.gyro = StuckGyro(rig, config.inputs)
-        self._turn, self.weights = steered_turn(rig, config.inputs), TerrainNoise(config)
+        self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
+        self._turn = steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
@@ -317,8 +317,7 @@ class Estimator:
             gained_mps = before.rolling * wheels.speed_change_mps
             segments = with_wheel_acceleration(segments, gained_mps / dt)
         segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
-        k = self.chain.last + 1
-        gyro, accel = mean_rates(segments)
+        k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
         gap = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:

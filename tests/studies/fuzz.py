@@ -1,10 +1,11 @@
 """Fuzzing of readers, YAML files, the live API and the command line: does anything end in a defect?
 
-    python -m tests.studies.fuzz --readers 4000 --yaml 2000 --live 2000 --cli 2000
+    python -m tests.studies.fuzz --readers 4000 --yaml 2000 --live 2000 --cli 2000 --out OUT
 
-Each case runs in a child process of its own, with 10 s and 1 GB of memory beyond what the parent has (the
-live API: twenty cases a child). It may work or be refused by a known error in one line; "crash", "hang" and
-"memory" are defects.
+Case i of a kind is the same in every run. Cases run one after the other in child processes, each with 10 s
+of processor time and 1 GB of memory beyond what the child has. A case may work or be refused by a known error
+in one line; "crash", "hang" and "memory" are defects: they are tried again in a child of their own, and what
+they read is kept in OUT. A run goes on where one was stopped.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import os
-import resource
 import shutil
+import signal
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,24 +32,20 @@ import numpy as np
 from tests.datasets import fuzz as readers
 from tests.datasets.fuzz_samples import write_samples
 
-HANG_S, MEMORY_BYTES = 10, 1 << 30
+KINDS = ("readers", "yaml", "live", "cli")
+HANG_S, WAITS_S, BATCH = 10.0, 120.0, 25
+"""Processor time, and time in all, after which a case hangs: a busy machine makes nothing slow."""
 OUTCOMES = {0: "worked", 1: "refused", 2: "crash", 3: "memory"}
 DEFECTS = ("crash", "hang", "memory")
-LIVE_BATCH = 20
 
 Task = Callable[[], bool]
 """Does one case; False where it is refused."""
 
 
-def outcome_of(task: Task, seconds: float = HANG_S) -> str:
-    """A task in a child, limited in time and memory."""
-    return readers.outcome_in_child(lambda: _in_child(task), seconds, OUTCOMES)
-
-
-def _in_child(task: Task) -> int:
-    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY_BYTES, now + MEMORY_BYTES))
+def status_of(task: Task) -> int:
+    """Exit status of a case: a key of `OUTCOMES`."""
     warnings.simplefilter("ignore")
+    readers.limit_memory()
     try:
         return 0 if task() else 1
     except MemoryError:
@@ -121,7 +121,7 @@ def yaml_case(rng: np.random.Generator, scratch: Path) -> Task:
 # --- live API --------------------------------------------------------------------------------------------
 
 
-def live_batch(seed: int) -> Task:
+def live_batch(seed: int, runs: int) -> Task:
     """Some runs of the rule-based machine."""
     from hypothesis import HealthCheck, Phase, settings
     from hypothesis import seed as seeded
@@ -133,7 +133,7 @@ def live_batch(seed: int) -> Task:
         run_state_machine_as_test(
             seeded(seed)(LiveMachine),
             settings=settings(
-                max_examples=LIVE_BATCH, stateful_step_count=10, deadline=None, database=None,
+                max_examples=runs, stateful_step_count=10, deadline=None, database=None,
                 derandomize=False, phases=[Phase.generate], suppress_health_check=list(HealthCheck),
             ),
         )  # fmt: skip
@@ -205,48 +205,113 @@ def cli_case(rng: np.random.Generator, sample: Path, scratch: Path) -> Task:
 # --- the run ---------------------------------------------------------------------------------------------
 
 
-def run(name: str, count: int, seed: int, scratch: Path, samples: list[Path]) -> Counter[str]:
-    """Outcomes of `count` cases of one kind; defects are told as they come."""
-    found: Counter[str] = Counter()
-    step = LIVE_BATCH if name == "live" else 1
-    for i in range(0, count, step):
-        rng = np.random.default_rng([seed, i])
-        folder = Path(tempfile.mkdtemp(dir=scratch, prefix=f"{name}-{i:05d}-"))
-        if name == "live":
-            outcome = outcome_of(live_batch(seed * 100_000 + i), HANG_S * LIVE_BATCH)
-        elif name == "readers":
-            path = readers.mutated(rng, samples[i % len(samples)], folder)
-            outcome = readers.outcome_of(path, repair_clock=bool(rng.random() < 0.5))
-            outcome = "worked" if outcome == "read" else outcome
-        elif name == "yaml":
-            outcome = outcome_of(yaml_case(rng, folder))
-        else:
-            outcome = outcome_of(cli_case(rng, samples[i % len(samples)], folder))
-        found[outcome] += step
-        if outcome in DEFECTS:
-            print(f"{name} {i}: {outcome}", file=sys.stderr)
-        else:
-            shutil.rmtree(folder, ignore_errors=True)
-    return found
+@dataclass(frozen=True)
+class Fuzzer:
+    """Cases of all kinds, by a seed."""
+
+    seed: int
+    scratch: Path
+    samples: list[Path]
+
+    def status(self, kind: str, i: int) -> int:
+        """The outcome of a case, in this process."""
+        rng, folder = np.random.default_rng([self.seed, i]), self.folder(kind, i)
+        folder.mkdir(parents=True, exist_ok=True)
+        sample = self.samples[i % len(self.samples)]
+        if kind == "live":
+            return status_of(live_batch(self.seed * 100_000 + i, 1))
+        if kind == "yaml":
+            return status_of(yaml_case(rng, folder))
+        if kind == "cli":
+            return status_of(cli_case(rng, sample, folder))
+        readers.limit_memory()
+        path = readers.mutated(rng, sample, folder)
+        return readers.examined(path, repair_clock=bool(rng.random() < 0.5))
+
+    def folder(self, kind: str, i: int) -> Path:
+        """Where a case keeps its files."""
+        return self.scratch / f"{kind}-{i:05d}"
+
+    def outcomes(self, kind: str, cases: list[int]) -> dict[int, str]:
+        """Outcomes of cases; those of defects by themselves."""
+        found: dict[int, str] = {}
+        while rest := [i for i in cases if i not in found]:
+            found |= self._in_one_child(kind, rest)
+        for i, outcome in found.items():
+            if outcome in DEFECTS and len(cases) > 1:
+                found[i] = self.outcomes(kind, [i])[i]
+        return found
+
+    def _in_one_child(self, kind: str, cases: list[int]) -> dict[int, str]:
+        """Outcomes of the first cases, up to the end of all, or to one that ends the child or hangs."""
+        told = self.scratch / "told"
+        told.write_bytes(b"")
+        child = os.fork()
+        if child == 0:
+            for i in cases:
+                status = self.status(kind, i)
+                with told.open("ab") as file:
+                    file.write(bytes([status]))
+            os._exit(0)
+        count, since, since_cpu_s, ended = 0, time.monotonic(), 0.0, False
+        while not ended:
+            ended, cpu_s = bool(os.waitpid(child, os.WNOHANG)[0]), readers.cpu_s(child)
+            if (size := told.stat().st_size) > count:
+                count, since, since_cpu_s = size, time.monotonic(), cpu_s
+            if cpu_s > since_cpu_s + HANG_S or time.monotonic() > since + WAITS_S:
+                break
+            time.sleep(0.005)
+        if not ended:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        found = {i: OUTCOMES[status] for i, status in zip(cases, told.read_bytes(), strict=False)}
+        if len(found) < len(cases):
+            found[cases[len(found)]] = "crash" if ended else "hang"
+        return found
+
+
+def run(fuzzer: Fuzzer, kind: str, count: int, kept: Path, until: float) -> Counter[str]:
+    """Outcomes of `count` cases of one kind, as far as time allows; what is in `kept` is not done again."""
+    file, total = kept / "outcomes.jsonl", Counter[str]()
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    done = {
+        row["first"]: row["outcomes"] for row in rows if (row["kind"], row["seed"]) == (kind, fuzzer.seed)
+    }
+    for first in range(0, count, BATCH):
+        if first not in done and time.monotonic() < until:
+            found = fuzzer.outcomes(kind, list(range(first, min(first + BATCH, count))))
+            for i, outcome in found.items():
+                if outcome in DEFECTS:
+                    print(f"{kind} {i}: {outcome}", file=sys.stderr, flush=True)
+                    shutil.copytree(fuzzer.folder(kind, i), kept / f"{kind}-{i:05d}", dirs_exist_ok=True)
+                shutil.rmtree(fuzzer.folder(kind, i), ignore_errors=True)
+            done[first] = Counter(found.values())
+            with file.open("a") as out:
+                row = {"kind": kind, "seed": fuzzer.seed, "first": first, "outcomes": done[first]}
+                out.write(json.dumps(row) + "\n")
+        total.update(done.get(first, {}))
+    return total
 
 
 def main() -> int:
     """Run and print one line a kind."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    for name in ("readers", "yaml", "live", "cli"):
+    for name in KINDS:
         parser.add_argument(f"--{name}", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=7200.0, help="stop after so long")
+    parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    scratch = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    given.out.mkdir(parents=True, exist_ok=True)
+    scratch, until = Path(tempfile.mkdtemp(prefix="fuzz-")), time.monotonic() + given.seconds
     sys.path.insert(0, str(Path(readers.__file__).parent))  # as the samples import their neighbours
     samples = write_samples(scratch / "samples")
     for sample in samples:  # in this process, so that every child starts with the parsers in memory
         readers.open_and_examine(sample / (sample / ".open").read_text(), repair_clock=False)
-    cases = defects = 0
-    for name in ("readers", "yaml", "live", "cli"):
-        found = run(name, getattr(given, name), given.seed, scratch, samples)
-        bad = sum(found[outcome] for outcome in DEFECTS)
-        cases, defects = cases + sum(found.values()), defects + bad
+    fuzzer, cases, defects = Fuzzer(given.seed, scratch, samples), 0, 0
+    for name in KINDS:
+        found = run(fuzzer, name, getattr(given, name), given.out.absolute(), until)
+        cases, defects = cases + sum(found.values()), defects + sum(found[outcome] for outcome in DEFECTS)
         told = ", ".join(f"{outcome} {found[outcome]}" for outcome in (*OUTCOMES.values(), "hang"))
         print(f"{name:8s} {sum(found.values()):5d} cases: {told}", flush=True)
     print(f"all {cases} cases, defects {defects}")

@@ -33,6 +33,7 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.scratch import PREFIX
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers import open_recording
+from tests.datasets.fuzz import cpu_s
 
 SCENARIO = """\
 description: a short drive with turns both ways
@@ -160,15 +161,12 @@ def watched(kill_event: int, sign: int = signal.SIGKILL) -> list[int]:
 
 def ended(child: int, work: Path, kill_cpu_s: float = 0.0, sign: int = signal.SIGKILL) -> End:
     """Waits for a child; after `kill_cpu_s` of computing it gets `sign`."""
-    deadline, cpu_s = time.monotonic() + LONGEST_S, 0.0
+    deadline = time.monotonic() + LONGEST_S
     while True:
         done, status, used = os.wait4(child, os.WNOHANG)
         if done:
             break
-        with contextlib.suppress(OSError, IndexError):
-            ticks = Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
-            cpu_s = sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
-        if kill_cpu_s and cpu_s >= kill_cpu_s:
+        if kill_cpu_s and cpu_s(child) >= kill_cpu_s:
             os.kill(child, sign)
             kill_cpu_s = 0.0
         if time.monotonic() > deadline:
@@ -291,12 +289,12 @@ def killed(name: str, work: Path, kills: int, seed: int = 0) -> Counter[str]:
     for i in range(kills):
         sign = signal.SIGINT if i % INTERRUPT_EVERY == INTERRUPT_EVERY - 1 else signal.SIGKILL
         event = int(rng.integers(1, clean.events + 1)) if i % 2 == 0 else 0
-        cpu_s = 0.0 if event else float(rng.uniform(0.02, 1.0)) * clean.cpu_s
-        end = ended(started(words, work, event, sign), work, cpu_s, sign)
+        after_s = 0.0 if event else float(rng.uniform(0.02, 1.0)) * clean.cpu_s
+        end = ended(started(words, work, event, sign), work, after_s, sign)
         count["kills"] += 1
         count["ended before"] += end.status == 0
         at = f"{name}, {'SIGINT' if sign == signal.SIGINT else 'SIGKILL'} " + (
-            f"before file operation {event} of {clean.events}" if event else f"after {cpu_s:.2f} s"
+            f"before file operation {event} of {clean.events}" if event else f"after {after_s:.2f} s"
         )
         if end.status not in (0, -sign, 130) or "Traceback" in end.err:
             _wrong(count, "odd end", f"{at}: {end.status} {end.err[-300:]}")

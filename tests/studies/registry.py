@@ -80,19 +80,31 @@ STUDIES = (
     Study(
         "fuzz",
         "Does any input of readers, YAML, live API or command line end in a crash or a hang?",
-        _module("fuzz", "--readers", "250", "--yaml", "600", "--live", "100", "--cli", "60"),
-        3,
+        _module(
+            "fuzz", "--readers", "4000", "--yaml", "2000", "--live", "2000", "--cli", "2000", "--out", OUT
+        ),
+        40,
         {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
     ),
     Study(
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
-        _module("fault_matrix.matrix", "--out", OUT),
-        20,
+        _module("fault_matrix.matrix", "--cells", "1000", "--seconds", "7200", "--out", OUT),
+        35,
         {
             "cells": r"cells (\d+)",
             **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
             "good_refused": r"ok and yet not good (\d+ of \d+)",
+        },
+    ),
+    Study(
+        "kills",
+        "Does a command that is killed, or a machine in trouble, leave half a result that passes for whole?",
+        _module("kills", "--out", OUT),
+        40,
+        {
+            **{name: rf"{name} (\d+)$" for name in ("kills", "defects", "troubles")},
+            "odd_troubles": r"troubles that end oddly (\d+)",
         },
     ),
     Study(

@@ -14,14 +14,15 @@ from terrafusion.datasets.core.scratch import PREFIX
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.simulate import OUTPUT
+from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
 from tests.studies.kills import watched
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    drive = simulate("straight", seed=1)
-    return dataclasses.replace(drive, truth=None, motor=None)
+    scenario = Scenario("short", 2.0, drive=(DriveSegment(2.0, 1.0),))
+    return dataclasses.replace(simulate(scenario, seed=1), truth=None, motor=None)
 
 
 def killed_writer(recording: Recording, folder: Path, before: int) -> bool:
