@@ -87,8 +87,7 @@ class FrictionEstimator:
             len(FRICTION_MPS2) - len(SLIPPERY), 0.5 * ROLLING_PRIOR / (len(FRICTION_MPS2) - len(SLIPPERY))
         )
         self._base = np.log([*(1.0 - ROLLING_PRIOR) * prior / prior.sum(), *dry, 0.5 * ROLLING_PRIOR])
-        self._prior = self._base
-        self._score = np.zeros(len(self._prior))
+        self._score = np.zeros(len(self._base))
         self._velocity: Array | None = None
         self._paths: deque[tuple[int, Array]] = deque()
         self._fixes: deque[tuple[int, Array, Array]] = deque()
@@ -98,22 +97,15 @@ class FrictionEstimator:
         """Whether the fixes favour the friction model over rolling wheels."""
         return self._leading() is not None
 
-    def base(self) -> Array:
-        """Prior probabilities (K + 1,) of the limits and of rolling, on any ground."""
-        return np.asarray(np.exp(self._base))
-
-    def scored(self) -> Array:
-        """Probabilities (K + 1,) by `base` and the fixes of the last while."""
-        weight = np.exp(self._base + self._score)
+    def probabilities(self) -> Array:
+        """Probabilities (K + 1,) of the friction models and, last, of rolling wheels."""
+        log_weight = self._base + self._score
+        weight = np.exp(log_weight - log_weight.max())
         return np.asarray(weight / weight.sum())
-
-    def expect(self, probabilities: Array) -> None:
-        """Prior probabilities (K + 1,) of the ground the robot is on."""
-        self._prior = np.log(np.maximum(probabilities, 1e-6))
 
     def _leading(self) -> slice | None:
         """The leading models: of slippery ground where likely, all where friction is nearly certain."""
-        weight = self._weights()
+        weight = self.probabilities()
         if float(weight[: len(SLIPPERY)].sum()) > 0.5:
             return slice(len(SLIPPERY))
         return slice(len(FRICTION_MPS2)) if float(weight[:-1].sum()) > LEAD_PROBABILITY else None
@@ -123,16 +115,10 @@ class FrictionEstimator:
         """Friction limit, m/s2, of a skidding robot."""
         return self._moments()[0]
 
-    def _weights(self) -> Array:
-        """Probabilities (K + 1,) of the friction models and, last, of rolling wheels."""
-        log_weight = self._prior + self._score
-        weight = np.exp(log_weight - log_weight.max())
-        return np.asarray(weight / weight.sum())
-
     def _moments(self) -> tuple[float, float]:
         """Mean and standard deviation of the friction limit, m/s2."""
         leading = self._leading() or slice(len(SLIPPERY))
-        weight, frictions = self._weights()[leading], FRICTION_MPS2[leading]
+        weight, frictions = self.probabilities()[leading], FRICTION_MPS2[leading]
         mean = float(weight @ frictions / weight.sum())
         return mean, math.sqrt(float(weight @ (frictions - mean) ** 2 / weight.sum()))
 
@@ -228,7 +214,7 @@ class FrictionEstimator:
         R = before.pose.rotation().matrix()
         if self._velocity is None:
             self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
-            here = np.tile((R @ self.antenna_m)[:2], (len(self._prior), 1))
+            here = np.tile((R @ self.antenna_m)[:2], (len(self._base), 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
         self._velocity, moved_m = skid_motion(self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s)
         rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _lateral_m(wheels, before)]

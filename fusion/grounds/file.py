@@ -34,7 +34,7 @@ class TallyFile:
 
 @dataclass(frozen=True)
 class GroundFile:
-    """Keys of one ground; see `ground.Ground`."""
+    """Keys of one ground; see `ground.Ground`. `evidence` is read and not used: older files have it."""
 
     name: str
     signature: dict[str, TallyFile]
@@ -42,7 +42,7 @@ class GroundFile:
     side_slip: TallyFile
     friction: tuple[Annotated[float, _SHARE], ...]
     friction_windows: Annotated[float, Quantity("", 0.0, 1e9)]
-    evidence: Annotated[float, Quantity("", -1e3, 1e3)]
+    evidence: Annotated[float, Quantity("", -1e3, 1e3)] = 0.0
     first: str = ""
     last: str = ""
 
@@ -111,7 +111,6 @@ def _ground(content: GroundFile) -> Ground:
         _tally([content.slip, content.side_slip]),
         friction / friction.sum() if friction.sum() > 0.0 else np.full(FRICTION_MODELS, 1 / FRICTION_MODELS),
         content.friction_windows,
-        content.evidence,
         content.first,
         content.last,
     )
@@ -131,7 +130,6 @@ def _written(ground: Ground) -> dict[str, object]:
         "side_slip": motion[1],
         "friction": [_rounded(p) for p in ground.friction.tolist()],
         "friction_windows": _rounded(ground.friction_windows),
-        "evidence": _rounded(ground.evidence),
         "first": ground.first,
         "last": ground.last,
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.grounds.signature import SIGNATURE
 
-YAW_SLIP = SIGNATURE.index("yaw_slip")
 SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.2])
 """Spread on one ground of the mean signature of 4 s, before any is known (learn runs of
 tests/studies/ground_split.yaml)."""
@@ -24,8 +22,6 @@ MOST_WINDOWS = 2000.0
 """Windows and stretches that are remembered: an older one fades, so that a ground may change."""
 FREEDOM = 8.0
 """Degrees of freedom of Student's t for signatures: some are outliers (kerbs, stones)."""
-SHRINK_FRICTION = 20.0
-"""Windows that the prior of friction counts for (assumed)."""
 FRICTION_MODELS = 10
 """Friction limits of the bank and, last, rolling (`estimator.friction`)."""
 SLIPPERY_MODELS = 6
@@ -76,7 +72,6 @@ class Ground:
         motion: slip and side-slip (2,), by stretches of several metres with good fixes.
         friction: (10,) probabilities of the friction limits of `estimator.friction` and of rolling.
         friction_windows: windows that gave them.
-        evidence: log Bayes factor of its friction against none remembered, recent windows.
         first, last: dates (YYYY-MM-DD) of the first and the last drive on it, "" where not known.
     """
 
@@ -85,7 +80,6 @@ class Ground:
     motion: Tally
     friction: Array
     friction_windows: float = 0.0
-    evidence: float = 0.0
     first: str = ""
     last: str = ""
 
@@ -104,11 +98,6 @@ class Ground:
     def stretches(self) -> float:
         """Stretches in which slip was measured."""
         return float(self.motion.count[0])
-
-    @property
-    def say(self) -> float:
-        """Weight in (0, 1] of what is remembered: below 1 where it predicted worse than nothing."""
-        return math.exp(min(self.evidence, 0.0))
 
     def variance(self) -> Array:
         """(10,) of a window's signature, shrunk to `SPREAD`."""
@@ -138,11 +127,6 @@ class Ground:
         mean = self.friction + weight / n * (friction - self.friction)
         return dataclasses.replace(self, friction=mean, friction_windows=n)
 
-    def friction_prior(self, prior: Array) -> Array:
-        """Probabilities (10,) of friction limits, shrunk to `prior`."""
-        n = self.friction_windows
-        return np.asarray((SHRINK_FRICTION * prior + n * self.friction) / (SHRINK_FRICTION + n))
-
     def merged(self, other: Ground) -> Ground:
         """This ground with what `other` knows of the same one."""
         windows = self.friction_windows + other.friction_windows
@@ -155,7 +139,6 @@ class Ground:
             self.motion.merged(other.motion),
             (1.0 - share) * self.friction + share * other.friction,
             windows,
-            min(self.evidence, other.evidence),
             min(dates, default=""),
             max(dates, default=""),
         )

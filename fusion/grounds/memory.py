@@ -1,5 +1,7 @@
 """The grounds of one robot: recognised from signatures, learned without labels, never with positions.
 
+A record for the user: nothing in the estimate depends on it.
+
 A filter over the known grounds and *new ground* follows the drive, as `terrain.sequence` does. Windows that
 no ground explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and Jordan 2012, ICML); grounds
 that came to look alike are merged.
@@ -107,8 +109,11 @@ class GroundMemory:
         best = max(g.log_likelihood(m, wider) for g, m in zip(self.grounds, middles, strict=True))
         return np.append(best - NOVEL, found)
 
-    def learn(self, date: str) -> None:
-        """Add the newest windows to their ground; to a new one where none explains them for long enough."""
+    def learn(self, date: str, friction: Array | None = None) -> None:
+        """Add the newest windows to their ground; to a new one where none explains them for long enough.
+
+        `friction` (10,) are probabilities of friction limits by the fixes, where they are known.
+        """
         if not self._recent:
             return
         signature = nan_mean(list(self._recent))
@@ -121,7 +126,8 @@ class GroundMemory:
         self._waiting.clear()
         if best:
             weight = float(self.belief[best])
-            self.grounds[best - 1] = self.grounds[best - 1].seen(signature, weight, date)
+            ground = self.grounds[best - 1].seen(signature, weight, date)
+            self.grounds[best - 1] = ground if friction is None else ground.slid(friction, weight)
 
     def _found(self, date: str) -> None:
         names = {g.name for g in self.grounds}
@@ -134,22 +140,6 @@ class GroundMemory:
         belief = np.append(self.belief, self.belief[0])
         belief[0] = NEW_SHARE * belief[-1]
         self.belief = belief / belief.sum()
-
-    def shares(self) -> Array:
-        """Weight (1 + K,) of no memory, then of each ground: its probability times its say."""
-        out = self.belief.copy()
-        for i, ground in enumerate(self.grounds, 1):
-            out[i] *= ground.say
-        out[0] = 1.0 - out[1:].sum()
-        return out
-
-    def friction_prior(self, prior: Array) -> Array:
-        """Probabilities (10,) of friction limits and rolling by the belief; `prior` on new ground."""
-        shares = self.shares()
-        out = shares[0] * prior
-        for share, ground in zip(shares[1:], self.grounds, strict=True):
-            out = out + share * ground.friction_prior(prior)
-        return np.asarray(out / out.sum())
 
     def named(self, names: dict[str, str]) -> GroundMemory:
         """With grounds renamed: old name -> new name; two of one name become one ground."""

@@ -1,15 +1,16 @@
-"""Errors in outages with ground memory, learned on some runs of a robot and judged on others.
+"""Errors in outages of adaptive over fixed weights on one robot, and whether memory knows its grounds.
 
-Fixes of 0.1 m are simulated from the truth. Memory is learned on the learn runs of
-`ground_split.yaml` one after another, without labels; outages are cut from the judge runs. The ratio is the
-geometric mean over outages of (error + 5 cm) over that of mode "fixed"; its interval is a bootstrap over
-runs, and a group of grounds counts each ground alike.
+Fixes of 0.1 m are simulated from the truth; outages are cut from the judge runs of `ground_split.yaml`. The
+ratio is the geometric mean over outages of (error + 5 cm) over that of mode "fixed"; its interval is a
+bootstrap over runs, and a group of grounds counts each ground alike. The memory is learned on the learn runs
+one after another, without labels, and asked on the judge runs; a remembered ground counts as the label on
+which it was met most.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.benchmark.field_logs import read_runs
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
-from terrafusion.fusion.grounds.file import load_grounds, save_grounds
+from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.health import rolled_until_m
 from terrafusion.fusion.metrics.scores import Outage
@@ -33,12 +34,12 @@ SLIPPING, FIRM = ("ice", "loose_sand", "gravel", "grass"), ("asphalt",)
 FLOOR_M, LEAST_M, LONG_S = 0.05, 3.0, 150.0
 """Added to errors; least path of the wheels in an outage; runs this long have outages of 30 s, else 15."""
 DRAWS = 2000
-METHODS = ("fixed", "no memory", "memory", "shuffled")
+MODES = ("fixed", "adaptive")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One outage: errors (m) at its end by method."""
+    """One outage: errors (m) at its end by mode."""
 
     ground: str
     run: str
@@ -56,27 +57,46 @@ def runs_of(robot: str, part: str) -> Iterator[tuple[str, str, Recording]]:
                     yield str(ground), f"{log}#{k}", aided_by_truth(run, 1)
 
 
-def learned(robot: str) -> GroundMemory:
-    """Memory after all learn runs of a robot."""
-    memory = GroundMemory(robot=robot)
-    for _, name, run in runs_of(robot, "learn"):
-        found = replay(run, grounds=memory).grounds
-        assert found is not None
-        memory = found
+def recognised(run: Recording, memory: GroundMemory) -> tuple[GroundMemory, Counter[str]]:
+    """The memory after a run, and how many keyframes it took for each of its grounds ("" for a new one)."""
+    seen: Counter[str] = Counter()
+
+    def watch(estimator: Estimator) -> None:
+        learner = estimator.weights.grounds
+        assert learner is not None
+        best = int(learner.memory.belief.argmax())
+        seen[learner.memory.grounds[best - 1].name if best else ""] += 1
+
+    after = replay(run, grounds=memory, watch=watch).grounds
+    assert after is not None
+    return after, seen
+
+
+def learned(robot: str) -> tuple[GroundMemory, dict[str, str]]:
+    """Memory after all learn runs of a robot, and the label on which each of its grounds was met most."""
+    memory, met = GroundMemory(robot=robot), dict[str, Counter[str]]()
+    for label, name, run in runs_of(robot, "learn"):
+        memory, seen = recognised(run, memory)
+        for ground, keyframes in seen.items():
+            met.setdefault(ground, Counter())[label] += keyframes
         print(f"learned {name}: {len(memory)} grounds", flush=True)
-    return memory
+    return memory, {ground: labels.most_common(1)[0][0] for ground, labels in met.items() if ground}
 
 
-def shuffled(memory: GroundMemory) -> GroundMemory:
-    """The memory with what it knows of slip and friction moved on to the next signature."""
-    moved = [*memory.grounds[1:], *memory.grounds[:1]]
-    return GroundMemory(
-        [
-            dataclasses.replace(g, motion=o.motion, friction=o.friction, friction_windows=o.friction_windows)
-            for g, o in zip(memory.grounds, moved, strict=True)
-        ],
-        memory.robot,
-    )
+def knowledge(robot: str) -> None:
+    """Print which share of the judge runs the memory takes for their label, for another, for new."""
+    memory, label_of = learned(robot)
+    found: dict[str, Counter[str]] = {}
+    for label, _, run in runs_of(robot, "judge"):
+        _, seen = recognised(run, memory)
+        for ground, keyframes in seen.items():
+            answer = "new" if ground not in label_of else "right" if label_of[ground] == label else "wrong"
+            found.setdefault(label, Counter())[answer] += keyframes
+    for label, answers in found.items():
+        shares = ", ".join(
+            f"{a} {100.0 * answers[a] / answers.total():.0f} %" for a in ("right", "wrong", "new")
+        )
+        print(f"memory on {label}: {shares}")
 
 
 def passes(run: Recording) -> list[list[Outage]]:
@@ -96,28 +116,26 @@ def passes(run: Recording) -> list[list[Outage]]:
     return [outages for outages in out if outages]
 
 
-def judged(robot: str, memory: GroundMemory) -> Iterator[Row]:
+def judged(robot: str) -> Iterator[Row]:
     """Rows of all judge runs of a robot."""
-    given = {"memory": memory, "shuffled": shuffled(memory)}
     for ground, name, run in runs_of(robot, "judge"):
         for outages in passes(run):
             errors: dict[float, dict[str, float]] = {}
-            for method in METHODS:
-                mode = "fixed" if method == "fixed" else "adaptive"
-                result = replay(run, mode=mode, outages=outages, grounds=given.get(method))
+            for mode in MODES:
+                result = replay(run, mode=mode, outages=outages)
                 for outage, found in zip(outages, result.scores.outages, strict=True):
                     if found.end_error_m is not None:
-                        errors.setdefault(outage.start_s, {})[method] = found.end_error_m
+                        errors.setdefault(outage.start_s, {})[mode] = found.end_error_m
             yield from (Row(ground, name, start, found) for start, found in errors.items())
         print(f"judged {name}", flush=True)
 
 
-def ratio(rows: list[Row], method: str, grounds: tuple[str, ...]) -> tuple[float, float, float]:
-    """Ratio of a method to "fixed" and its 95 % interval, each ground alike."""
+def ratio(rows: list[Row], grounds: tuple[str, ...]) -> tuple[float, float, float]:
+    """Ratio of "adaptive" to "fixed" and its 95 % interval, each ground alike."""
     logs: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         if row.ground in grounds:
-            own, fixed = (row.errors_m[m] + FLOOR_M for m in (method, "fixed"))
+            own, fixed = (row.errors_m[m] + FLOOR_M for m in ("adaptive", "fixed"))
             logs.setdefault(row.ground, {}).setdefault(row.run, []).append(float(np.log(own / fixed)))
 
     def mean(drawn: dict[str, list[list[float]]]) -> float:
@@ -140,26 +158,19 @@ def report(rows: list[Row]) -> None:
         own = [row for row in rows if row.ground in grounds]
         if not own:
             continue
-        medians = ", ".join(f"{m} {np.median([r.errors_m[m] for r in own]):.2f}" for m in METHODS)
+        medians = ", ".join(f"{m} {np.median([r.errors_m[m] for r in own]):.2f}" for m in MODES)
         print(f"{name}: {len(own)} outages, {len({r.run for r in own})} runs; median error, m: {medians}")
-        for method in METHODS[1:]:
-            mean, low, high = ratio(rows, method, grounds)
-            print(f"{name}, {method} over fixed: {mean:.2f} [{low:.2f}, {high:.2f}]")
+        mean, low, high = ratio(rows, grounds)
+        print(f"{name}, adaptive over fixed: {mean:.2f} [{low:.2f}, {high:.2f}]")
 
 
 def main() -> int:
-    """Learn, judge, print."""
+    """Judge, ask the memory, print."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.grounds", description=__doc__)
     parser.add_argument("--robot", default="warthog", help="a robot of ground_split.yaml")
-    parser.add_argument("--memory", type=Path, help="file of the memory: read if it is there, else written")
-    words = parser.parse_args()
-    if words.memory is not None and words.memory.exists():
-        memory = load_grounds(words.memory)
-    else:
-        memory = learned(words.robot)
-        if words.memory is not None:
-            save_grounds(memory, words.memory)
-    report(list(judged(words.robot, memory)))
+    robot = parser.parse_args().robot
+    report(list(judged(robot)))
+    knowledge(robot)
     return 0
 
 

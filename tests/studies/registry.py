@@ -274,13 +274,40 @@ STUDIES = (
     ),
     Study(
         "grounds",
-        "What do adaptive mode and ground memory gain in outages on the field logs of one robot?",
+        "What does adaptive mode gain in outages on logs of one robot, and does memory know its grounds?",
         _module("grounds"),
         8,
         {
-            f"{group}_{method.replace(' ', '_')}": rf"{group}, {method} over fixed: ([\d.]+) "
+            f"{group}_adaptive": rf"{group}, adaptive over fixed: ([\d.]+) "
             for group in ("slipping", "firm", "all", "ice", "loose_sand", "gravel", "grass")
-            for method in ("no memory", "memory", "shuffled")
+        }
+        | {
+            f"memory_{ground}_right": rf"memory on {ground}: right (\d+ %)"
+            for ground in ("asphalt", "grass", "gravel", "ice", "loose_sand")
+        },
+    ),
+    Study(
+        "slip_model",
+        "Can wheels and IMU alone predict slip on a robot, soil or data set that nothing was fitted to?",
+        _module("slip_model.study"),
+        5,
+        {
+            "fresh_rmse": r"twin, fresh drives +\d+ +([\d.]+)",
+            "fresh_own_past": r"twin, fresh drives +\d+ +[\d.]+ +[\d.]+ +([\d.]+)",
+            "fresh_in_95": r"twin, fresh drives +\d+ +[\d.]+ +[\d.]+ +[\d.]+ +\d+ +(\d+)",
+        }
+        | {
+            f"{robot}_{what}": rf"real, {robot} +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for robot in ("warthog", "husky", "pathfinder")
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+        }
+        | {
+            f"memory_{what}": r"own past, warthog +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+        }
+        | {
+            f"slippery_{source}": rf"twin to {source} +\d+ runs: balanced accuracy [\d.]+ by window, ([\d.]+)"
+            for source in ("norlab_drive", "borealtc")
         },
     ),
     Study(

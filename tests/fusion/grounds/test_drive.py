@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.file import save_grounds
+from terrafusion.fusion.grounds.ground import FRICTION_MODELS
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.twin.model.vehicle import as_vehicle
 
@@ -36,9 +38,12 @@ def test_a_drive_adds_to_the_memory_and_the_next_one_goes_on(drive: Recording, t
     assert second.grounds[0].windows > 1.5 * first.grounds[0].windows
 
 
-def test_memory_of_rolling_grounds_changes_no_bit(drive: Recording) -> None:
+def test_what_is_remembered_changes_no_bit(drive: Recording) -> None:
+    """Even where the remembered ground is said to be ice."""
     memory = tf.replay(drive, grounds=GroundMemory()).grounds
-    plain, remembered = (tf.replay(drive, grounds=g) for g in (None, memory))
+    assert memory is not None
+    ice = dataclasses.replace(memory.grounds[0], friction=np.eye(FRICTION_MODELS)[0], friction_windows=1000.0)
+    plain, remembered = (tf.replay(drive, grounds=g) for g in (None, GroundMemory([ice])))
     np.testing.assert_array_equal(
         plain.estimate.trajectory.position_m, remembered.estimate.trajectory.position_m
     )

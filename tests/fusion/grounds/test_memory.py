@@ -12,8 +12,7 @@ import pytest
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.file import load_grounds, save_grounds
-from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Ground, Tally
-from terrafusion.fusion.grounds.learner import with_evidence
+from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
 from terrafusion.fusion.grounds.memory import DWELL, GroundMemory, merged
 from terrafusion.fusion.grounds.signature import SIGNATURE, VIBRATION, SignatureExtractor
 from terrafusion.fusion.grounds.stretches import StretchMeter
@@ -131,35 +130,13 @@ def test_stretches_measure_slip() -> None:
     assert [s.side for s in found] == pytest.approx([0.0] * len(found), abs=1e-9)
 
 
-def slippery(at: int) -> Ground:
-    """A ground on which one friction limit is certain."""
-    friction = np.zeros(FRICTION_MODELS)
-    friction[at] = 1.0
-    return dataclasses.replace(Ground.new("ground 1"), friction=friction, friction_windows=200.0)
-
-
-def test_no_memory_leaves_the_prior_of_friction() -> None:
-    base = np.full(FRICTION_MODELS, 1.0 / FRICTION_MODELS)
-    np.testing.assert_array_equal(GroundMemory().friction_prior(base), base)
-    np.testing.assert_allclose(Ground.new("ground 1").friction_prior(base), base)
-    memory = GroundMemory([slippery(3)])
-    memory.belief = np.array([0.0, 1.0])
-    assert memory.friction_prior(base)[3] > 0.8
-    memory.belief = np.array([1.0, 0.0])
-    np.testing.assert_allclose(memory.friction_prior(base), base)
-
-
-@pytest.mark.parametrize(("truth", "say"), [(9, 0.2), (3, 1.0)])
-def test_memory_of_friction_that_fixes_refute_loses_its_say(truth: int, say: float) -> None:
-    base = np.full(FRICTION_MODELS, 1.0 / FRICTION_MODELS)
-    scored = np.full(FRICTION_MODELS, 1e-3)
-    scored[truth] = 1.0
-    ground = slippery(3)
-    for _ in range(40):
-        ground = with_evidence(ground, scored / scored.sum(), base)
-    assert ground.say <= say
-    if say == 1.0:
-        assert ground.evidence > 0.0
+def test_friction_of_a_ground_is_the_mean_of_its_windows() -> None:
+    rng, memory = np.random.default_rng(8), GroundMemory()
+    friction = np.eye(FRICTION_MODELS)[3]
+    for _ in range(120):
+        memory.recognise(signature(SMOOTH, rng), 0.5)
+        memory.learn("", friction)
+    assert memory.grounds[0].friction[3] > 0.95
 
 
 def test_robots_of_one_type_share_their_grounds() -> None:
@@ -191,7 +168,7 @@ def test_a_file_gives_the_same_memory_and_holds_no_position(tmp_path: Path) -> N
         ("terrafusion.grounds/1", "terrafusion.grounds/9", "schema"),
         ("z_low", "z_lowest", "z_lowest"),
         ("name: ground 2", "name: ground 1", "different name"),
-        ("evidence", "evidenz", "evidenz"),
+        ("friction_windows", "friktion_windows", "friktion_windows"),
     ],
 )
 def test_a_wrong_file_is_refused_in_a_line(tmp_path: Path, old: str, new: str, said: str) -> None:

@@ -1,0 +1,1 @@
+"""Slip predicted from wheels and IMU alone: a population of twin drives, features, model, judgement."""
