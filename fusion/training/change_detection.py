@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.training.softmax import SoftmaxModel
-from terrafusion.fusion.training.surface_features import Signals, surface_windows
+from terrafusion.fusion.training.surface_features import HOP_S, WINDOW_S, Signals, surface_windows
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class ChangeDetection:
     """Detection of changes of ground: quantiles of the delays, s, and shares of all changes.
 
     A change is detected when the new ground first has the largest probability, and missed (`never`) if that
-    does not happen before the next change; `right` is the share of correctly classified windows.
+    does not happen before the next change; `right` is the share of correctly classified windows. `alarms` is
+    the share of changes with an alarm within `SEEN_WITHIN_S`, `false_alarms` the number a minute elsewhere.
     """
 
     median_s: float
@@ -35,6 +36,8 @@ class ChangeDetection:
     never: float
     right: float
     changes: int
+    alarms: float
+    false_alarms: float
 
 
 def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, list[tuple[float, str]]]:
@@ -92,23 +95,44 @@ def delays(
     return found, right / max(len(ends), 1)
 
 
+def alarms(
+    model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
+) -> tuple[list[bool], int, float]:
+    """Whether each change raises an alarm in time; the number of other alarms, and their minutes."""
+    windows = surface_windows(route)
+    raised, ends = model.changes(windows), windows.end_s
+    elsewhere = np.ones(len(ends), dtype=bool)
+    in_time = []
+    for begin, _ in begins[1:]:
+        in_time.append(bool(raised[(ends > begin) & (ends <= begin + SEEN_WITHIN_S)].any()))
+        elsewhere &= ~((ends > begin) & (ends <= begin + WINDOW_S + 1.0))
+    return in_time, int(raised[elsewhere].sum()), float(elsewhere.sum()) * HOP_S / 60.0
+
+
 def changes_seen(
-    models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]]
+    models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]], first_seed: int = 0
 ) -> ChangeDetection | None:
-    """Each model on two routes over its held-out runs (signals, label).
+    """Each model on two routes over its held-out runs (signals, label), with seeds from `first_seed`.
 
     None if no model has long enough runs of two grounds.
     """
     found: list[float] = []
     right: list[float] = []
+    raised: list[bool] = []
+    false, minutes = 0, 0.0
     for fold, (model, given) in enumerate(zip(models, held_out, strict=True)):
         runs = [(signals, label) for signals, label in given if signals.end_s() > MIN_RUN_S]
         if len({label for _, label in runs}) < 2:
             continue
-        for seed in (2 * fold, 2 * fold + 1):
-            here, share = delays(model, *spliced(runs, seed))
+        for seed in (first_seed + 2 * fold, first_seed + 2 * fold + 1):
+            route = spliced(runs, seed)
+            here, share = delays(model, *route)
             found += here
             right.append(share)
+            seen, others, spent = alarms(model, *route)
+            raised += seen
+            false += others
+            minutes += spent
     if not found:
         return None
     seen = np.array([d for d in found if np.isfinite(d)])
@@ -119,4 +143,6 @@ def changes_seen(
         never=float(np.mean(~np.isfinite(found))),
         right=float(np.mean(right)),
         changes=len(found),
+        alarms=float(np.mean(raised)),
+        false_alarms=false / minutes if minutes else 0.0,
     )

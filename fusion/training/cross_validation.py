@@ -15,6 +15,7 @@ from terrafusion.datasets.catalog.catalog import sha256_of
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of
 from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
+from terrafusion.fusion.training.change_alarm import precision_of
 from terrafusion.fusion.training.softmax import (
     UNKNOWN_SHARE,
     SoftmaxModel,
@@ -152,7 +153,7 @@ def train_on(
         ConfigError: fewer than two grounds.
         DataError: no ground has a second run.
     """
-    model = fit_softmax(np.vstack([r.x for r in runs]), labels_of(runs), features)
+    model = _fitted(runs, features)
     if temperature is not None:
         return dataclasses.replace(model, temperature=temperature)
     fold_of = assign_folds(runs, INNER_FOLDS)
@@ -161,7 +162,7 @@ def train_on(
         inner = [r for r, f in zip(runs, fold_of, strict=True) if f != fold]
         if {r.label for r in inner} != set(model.classes):
             continue
-        part = fit_softmax(np.vstack([r.x for r in inner]), labels_of(inner), features)
+        part = _fitted(inner, features)
         held_out += [(part, r) for r, f in zip(runs, fold_of, strict=True) if f == fold]
     if not held_out:
         raise DataError(
@@ -177,6 +178,12 @@ def train_on(
 
     odd = np.quantile(np.concatenate([m.oddness(r.x) for m, r in held_out]), 1.0 - UNKNOWN_SHARE)
     return dataclasses.replace(model, temperature=min(TEMPERATURES, key=loss), odd_distance=float(odd))
+
+
+def _fitted(runs: Sequence[LabelledRun], features: Sequence[str]) -> SoftmaxModel:
+    """A model with the alarm of changes, not yet calibrated."""
+    model = fit_softmax(np.vstack([r.x for r in runs]), labels_of(runs), features)
+    return dataclasses.replace(model, alarm=precision_of([model.log_odds(r.windows.recent) for r in runs]))
 
 
 def labels_of(runs: Sequence[LabelledRun]) -> list[str]:

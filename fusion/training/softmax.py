@@ -20,6 +20,7 @@ from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
+from terrafusion.fusion.training.change_alarm import has_changed
 from terrafusion.fusion.training.surface_features import (
     GROUPS,
     HOP_S,
@@ -30,13 +31,9 @@ from terrafusion.fusion.training.surface_features import (
 
 Array = NDArray[np.float64]
 
-SCHEMA = "terrafusion.surface/1"
+SCHEMA = "terrafusion.surface/2"
 UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
-BREAK_MEMORY = 6
-BREAK_FROM = 0.75
-"""Total variation between the class probabilities of the last second and the mean of the six before above
-which the patch ends: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
 STRADDLES = round(WINDOW_S / HOP_S)
 """Windows after a change that contain some of the ground before: for them only the last second is used."""
 STRENGTH = 0.1
@@ -45,7 +42,7 @@ ERROR_SHARE = 1e-3
 """Probability floor, so that no single window excludes a class."""
 UNKNOWN_SHARE = 0.05
 """Share of windows of known ground that may be classified as unknown (split conformal, Vovk et al. 2005)."""
-_NUMBERS = ("mean", "scale", "weights", "offsets", "centres", "precision")
+_NUMBERS = ("mean", "scale", "weights", "offsets", "centres", "precision", "alarm")
 _PLAIN = ("schema", "made_by", "inputs", "features", "classes", "temperature", "odd_distance")
 
 
@@ -60,6 +57,8 @@ class SoftmaxModel:
         centres, precision: (k, d) class means and (d, d) inverse scatter within classes, standardised.
         odd_distance: novelty threshold: squared Mahalanobis distance per observed feature from the nearest
             class beyond which a window is unknown.
+        alarm: (k, k) inverse scatter of log-odds along a drive on one ground, see `change_alarm`; zeros
+            raise no alarm.
         temperature: divisor of the log-probabilities before the patch filter, as windows overlap.
         inputs: file name -> SHA-256 of the training logs.
     """
@@ -71,6 +70,7 @@ class SoftmaxModel:
     offsets: Array
     centres: Array
     precision: Array
+    alarm: Array
     odd_distance: float = np.inf
     temperature: float = 1.0
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -80,9 +80,14 @@ class SoftmaxModel:
         """Standardised features (n, d), 0 where not observed."""
         return np.nan_to_num((np.atleast_2d(x) - self.mean) / self.scale)
 
+    def log_odds(self, x: Array) -> Array:
+        """Log-odds (n, k) of the classes against their geometric mean."""
+        logits = self.standardised(x) @ self.weights.T + self.offsets
+        return np.asarray(logits - logits.mean(axis=1, keepdims=True))
+
     def log_probabilities(self, x: Array) -> Array:
         """log P(class | window) (n, k), equal priors, each at least about log `ERROR_SHARE`."""
-        logits = self.standardised(x) @ self.weights.T + self.offsets
+        logits = self.log_odds(x)
         p = np.exp(logits - logits.max(axis=1, keepdims=True))
         p /= p.sum(axis=1, keepdims=True)
         k = len(self.classes)
@@ -97,18 +102,31 @@ class SoftmaxModel:
         observed = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
         return np.asarray(distance.min(axis=1) / observed)
 
+    def changes(self, windows: SurfaceWindows) -> NDArray[np.bool_]:
+        """Which of the n windows of a drive raise the alarm of a change of ground."""
+        odds, begin = self.log_odds(windows.recent), 0
+        found = np.zeros(len(odds), dtype=bool)
+        for i in range(len(odds)):
+            found[i] = has_changed(odds[begin : i + 1], self.alarm)
+            begin = i if found[i] else begin
+        return found
+
     def filtered(self, windows: SurfaceWindows) -> Array:
-        """Class probabilities (n, k) along the n windows of a drive."""
+        """Class probabilities (n, k) along the n windows of a drive.
+
+        After an alarm the patch begins anew, and is classified by seconds of the new ground alone: few
+        windows, which count in full.
+        """
         log_p, recent = self.log_probabilities(windows.x), self.log_probabilities(windows.recent)
         patches = PatchFilter(len(self.classes), PATCH_LENGTH_M)
         p = np.empty_like(log_p)
         age = STRADDLES
-        for i, rolled in enumerate(windows.rolled_m):
+        for i, (rolled, changed) in enumerate(zip(windows.rolled_m, self.changes(windows), strict=True)):
             patches.predict(float(rolled))
-            share = _change_evidence(np.exp(recent[max(i - BREAK_MEMORY, 0) : i + 1]))
-            patches.forget(share)
-            age = 0 if share > 0.5 else age + 1
-            p[i] = patches.update((recent if age < STRADDLES else log_p)[i] / self.temperature)
+            if changed:
+                patches.forget(1.0)
+            age = 0 if changed else age + 1
+            p[i] = patches.update(recent[i] if age < STRADDLES else log_p[i] / self.temperature)
         return p
 
     def write(self, path: Path) -> None:
@@ -125,14 +143,6 @@ class SoftmaxModel:
         yaml.default_flow_style = None
         yaml.width = 110
         write_atomically(path, lambda part: yaml.dump(content, part))
-
-
-def _change_evidence(p: Array) -> float:
-    """Evidence, 0 to 1, that the ground of the last of the class probabilities (m, k) is a new one."""
-    if len(p) < 4:
-        return 0.0
-    away = 0.5 * float(np.abs(p[-1] - p[:-1].mean(axis=0)).sum())
-    return min(max(0.0, (away - BREAK_FROM) / (1.0 - BREAK_FROM)), 1.0)
 
 
 def read_softmax(path: Path) -> SoftmaxModel:
@@ -160,6 +170,7 @@ def read_softmax(path: Path) -> SoftmaxModel:
         "offsets": (k,),
         "centres": (k, d),
         "precision": (d, d),
+        "alarm": (k, k),
     }
     for name, shape in shapes.items():
         if numbers[name].shape != shape or not np.isfinite(numbers[name]).all():
@@ -175,7 +186,7 @@ def read_softmax(path: Path) -> SoftmaxModel:
 
 
 def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFACE_FEATURES) -> SoftmaxModel:
-    """Fit to windows (n, d) with a label each, by `features` alone; not yet calibrated.
+    """Fit to windows (n, d) with a label each, by `features` alone; not yet calibrated, and without alarm.
 
     Classes have equal weight.
 
@@ -208,7 +219,8 @@ def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFA
     centres = np.stack([z[y == c].mean(axis=0) for c in range(len(classes))])
     scatter = np.cov((z - centres[y]).T) + 0.1 * np.eye(z.shape[1])
     precision: Array = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
-    return SoftmaxModel(tuple(classes.tolist()), mean, scale, weights, offsets, centres, precision)
+    silent = np.zeros((len(classes), len(classes)))
+    return SoftmaxModel(tuple(classes.tolist()), mean, scale, weights, offsets, centres, precision, silent)
 
 
 def _with_gaps(z: Array, y: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:

@@ -228,7 +228,8 @@ def _change(change: dict[str, Any] | None) -> str:
     return (
         f"change of ground detected after {change['median_s']:.1f} s (median), "
         f"{change['p95_s']:.1f} s (95 %); within 2 s "
-        f"{change['within_2_s']:.0%}, missed {change['never']:.0%} of {change['changes']}"
+        f"{change['within_2_s']:.0%}, missed {change['never']:.0%} of {change['changes']}; alarm within 2 s "
+        f"{change['alarms']:.0%}, false alarms {change['false_alarms']:.2f} a minute"
     )
 
 

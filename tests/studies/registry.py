@@ -287,6 +287,20 @@ STUDIES = (
         },
     ),
     Study(
+        "ground_changes",
+        "How soon is a change of ground noticed, and named, by a classifier of the robot's own grounds?",
+        _module("ground_changes"),
+        3,
+        {
+            "macro_f1": r"macro-F1 ([\d.]+)",
+            "ece": r"macro-F1 [\d.]+, ECE ([\d.]+)",
+            "alarm_within_2_s": r"alarm within 2 s: (\d+ ?%)",
+            "false_alarms": r"false alarms a minute: ([\d.]+)",
+            "named_within_2_s": r"new ground named within 2 s: (\d+ ?%)",
+            "named_after_s": r"new ground named after, median: ([\d.]+)",
+        },
+    ),
+    Study(
         "slip_model",
         "Can wheels and IMU alone predict slip on a robot, soil or data set that nothing was fitted to?",
         _module("slip_model.study"),

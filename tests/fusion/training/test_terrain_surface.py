@@ -205,6 +205,23 @@ def test_a_change_is_seen_while_the_window_still_shows_both_grounds(
     assert (named[20:] == "gravel").all()
 
 
+def test_a_change_raises_one_alarm_within_two_seconds_and_a_drive_on_one_ground_none(
+    model: SoftmaxModel, runs: Sequence[LabelledRun]
+) -> None:
+    lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
+    drive = SurfaceWindows(
+        0.5 * np.arange(40.0), np.vstack([lawn.x[:20], gravel.x[:20]]),
+        np.vstack([lawn.recent[:20], gravel.recent[:20]]), np.full(40, 0.25),
+    )  # fmt: skip
+    alarms = np.flatnonzero(model.changes(drive))
+    assert len(alarms) == 1
+    assert 20 <= alarms[0] < 24
+    held_out = [r for r in runs if r.name.endswith("5")]
+    assert np.mean([model.changes(r.windows).mean() for r in held_out]) < 0.02
+    silent = dataclasses.replace(model, alarm=np.zeros_like(model.alarm))
+    assert not silent.changes(drive).any()
+
+
 def test_one_odd_second_does_not_lose_the_ground(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> None:
     lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
     recent = lawn.recent.copy()
@@ -234,7 +251,7 @@ def test_written_and_read_back(model: SoftmaxModel, tmp_path: Path, runs: Sequen
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("terrafusion.surface/1", "terrafusion.surface/7", "no model"),
+        ("terrafusion.surface/2", "terrafusion.surface/7", "no model"),
         ("temperature:", "heat:", "no model"),
         ("temperature: ", "temperature: -", "positive"),
         ("offsets: [", "offsets: [1.0, ", "'offsets'"),
