@@ -129,8 +129,8 @@ def changes_seen(
             here, share = delays(model, *route)
             found += here
             right.append(share)
-            seen, others, spent = alarms(model, *route)
-            raised += seen
+            in_time, others, spent = alarms(model, *route)
+            raised += in_time
             false += others
             minutes += spent
     if not found:

@@ -134,6 +134,10 @@ STUDIES = (
             for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
             for mode in ("fixed", "adaptive")
             for i, what in enumerate(("ate_m", "median_m", "end_m"))
+        }
+        | {
+            f"{drive}_ratio": rf"{drive}, adaptive over fixed at the end: ([\d.]+ \[[\d.]+, [\d.]+\])"
+            for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
         },
     ),
     Study(
@@ -306,9 +310,11 @@ STUDIES = (
         _module("slip_model.study"),
         5,
         {
-            "fresh_rmse": r"twin, fresh drives +\d+ +([\d.]+)",
-            "fresh_own_past": r"twin, fresh drives +\d+ +[\d.]+ +[\d.]+ +([\d.]+)",
-            "fresh_in_95": r"twin, fresh drives +\d+ +[\d.]+ +[\d.]+ +[\d.]+ +\d+ +(\d+)",
+            "drives": r"(\d+) drives of the twin",
+        }
+        | {
+            f"fresh_{what}": r"twin, fresh drives +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
         }
         | {
             f"{robot}_{what}": rf"real, {robot} +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
