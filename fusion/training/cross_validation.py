@@ -35,7 +35,7 @@ FOLDS = 5
 INNER_FOLDS = 4
 MIN_RUNS = 2
 """Of a ground: one to train on, one to test."""
-TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 """Windows of 2 s every 0.5 s overlap fourfold, and errors within a run are correlated. Calibrated on runs of
 one ground, the temperature would be higher and changes of ground be detected later
 (docs/explanation/terrain.md)."""
