@@ -47,7 +47,7 @@ class GroundLearner:
     def __init__(self, memory: GroundMemory | None = None) -> None:
         self.memory = GroundMemory() if memory is None else memory.copy()
         self._extractor, self._meter = SignatureExtractor(), StretchMeter()
-        self._passed: Counter[int] = Counter()
+        self._passed: list[int] = []  # most probable ground of each window of the stretch
 
     def update(self, window: Window, state: State, rolled_m: float, friction: FrictionBank | None) -> None:
         """One window that ends at `state`, in which the wheels rolled `rolled_m` since the last one."""
@@ -63,15 +63,15 @@ class GroundLearner:
             self._meter.restart()
             self._passed.clear()
             return
-        self._passed[int(memory.belief.argmax())] += 1
+        self._passed.append(int(memory.belief.argmax()))
         stretch = self._meter.add(state, rolled_m)
         if stretch is not None:
             self._learn_stretch(stretch)
             self._passed.clear()
 
     def _learn_stretch(self, stretch: SlipStretch) -> None:
-        best, windows = self._passed.most_common(1)[0]
-        share = windows / self._passed.total()
+        best, windows = Counter(self._passed).most_common(1)[0]
+        share = windows / len(self._passed)
         if best == 0 or share < SURE or stretch.sigma > USABLE:
             return
         ground, entry = self.memory.grounds[best - 1], np.array([stretch.slip, stretch.side])
