@@ -144,7 +144,8 @@ class Estimator:
                 "the estimator is configured without an IMU", channel="imu", remedy="mend `inputs`"
             )
         self.imu.add(t_ns, self.gyro.checked(t_ns, gyro_radps, self.wheels), accel_mps2)
-        self._advance()
+        if self._fresh is not None or not self.chain.nodes or self._due() is not None:
+            self._advance()
 
     def add_wheels(
         self,
@@ -258,20 +259,18 @@ class Estimator:
                 return
             self._begin(start)
         newest = self.chain.last
-        while self._ready(t := self.imu.next_ns(self.chain.nodes[-1].t_ns, self._step_ns), last):
-            self._keyframe(t)
+        while (t_ns := self._due(last)) is not None:
+            self._keyframe(t_ns)
         if self.chain.last == newest or last:
             self._upkeep()
 
-    def _ready(self, t_ns: int, last: bool) -> bool:
-        """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
-        if not self.imu.covers(t_ns):
-            return False
-        if last or self.wheels.covers(t_ns):
-            return True
-        if not self.imu.covers(t_ns + round(self.config.wheel_wait_s * 1e9)):
-            return False
-        return self.imu.covers(t_ns + round(1.5e9 * usual_interval_s(self.wheels.t_ns)))
+    def _due(self, last: bool = False) -> int | None:
+        """Time of the next keyframe, once the samples cover it or the wheels have been waited for."""
+        t_ns, covers = self.imu.next_ns(self.chain.nodes[-1].t_ns, self._step_ns), self.imu.covers
+        if covers(t_ns) and (last or self.wheels.covers(t_ns)):
+            return t_ns
+        waited = covers(t_ns + round(self.config.wheel_wait_s * 1e9))
+        return t_ns if waited and covers(t_ns + round(1.5e9 * usual_interval_s(self.wheels.t_ns))) else None
 
     def _begin(self, start: Start) -> None:
         slowest_s = max(usual_interval_s(self.imu.t_ns), usual_interval_s(self.wheels.t_ns))

@@ -13,14 +13,18 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from scipy.linalg import lapack
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.keyframe_rows import carried_prior
-from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
+from terrafusion.fusion.graph.triangular import (
+    back_substitute,
+    back_substitute_before,
+    eliminated,
+    triangular,
+)
 
 BLOCK = 500
 """Keyframes whose rows are held at a time."""
@@ -141,12 +145,8 @@ class BatchSmoother:
         dim = self.dim
         out = np.empty((self.size, dim))
         out[-1] = back_substitute(self._root[:, :dim], self._root[:, dim])
-        for k in range(self.size - 2, -1, -1):
-            conditional = self._conditionals[k]
-            rhs = conditional[:, 2 * dim] - conditional[:, dim : 2 * dim] @ out[k + 1]
-            out[k], _ = lapack.dtrtrs(conditional[:, :dim], rhs)
-        if not np.isfinite(out).all():
-            raise ArithmeticError("a keyframe is not determined by its factors")
+        if self.size > 1:
+            out[-2::-1] = back_substitute_before(self._conditionals[::-1], out[-1])
         return out
 
     def _step_length(self) -> float:

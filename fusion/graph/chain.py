@@ -31,7 +31,13 @@ from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, NAV, POSE, VELOCITY, KeyState, dim_of
 from terrafusion.fusion.graph.keyframe_rows import SYMBOLS, carried_prior, link_rows, measured_rows, own_rows
 from terrafusion.fusion.graph.node import Node
-from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
+from terrafusion.fusion.graph.triangular import (
+    back_substitute,
+    back_substitute_before,
+    covariance_before,
+    eliminated,
+    triangular,
+)
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
@@ -358,9 +364,9 @@ class Chain:
     def _back_substitute_to(self, begin: int, solved: int | None = None) -> int:
         """Solve for the keyframes from `begin` on, those from `solved` on (the newest) being so; `begin`."""
         solved = self.last if solved is None else solved
-        dim, following = self.dim, self.nodes[solved - self.first].delta
-        for node in self.nodes[begin - self.first : solved - self.first][::-1]:
-            assert node.conditional is not None
-            rhs = node.conditional[:, 2 * dim] - node.conditional[:, dim : 2 * dim] @ following
-            node.delta = following = back_substitute(node.conditional[:, :dim], rhs)
+        nodes = self.nodes[begin - self.first : solved - self.first][::-1]
+        conditionals = (node.conditional for node in nodes if node.conditional is not None)
+        found = back_substitute_before(conditionals, self.nodes[solved - self.first].delta)
+        for node, delta in zip(nodes, found, strict=True):
+            node.delta = delta
         return begin

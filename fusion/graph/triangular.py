@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.linalg import lapack
@@ -49,6 +50,24 @@ def back_substitute(R: Array, rhs: Array) -> Array:
     if info or not math.isfinite(solution.sum()):
         raise ArithmeticError("a keyframe is not determined by its factors")
     return np.asarray(solution)
+
+
+def back_substitute_before(conditionals: Iterable[Array], following: Array) -> list[Array]:
+    """Solutions of states from that of the one after them, and `eliminated`'s first rows; the newest first.
+
+    Raises:
+        ArithmeticError: as `back_substitute`.
+    """
+    dim, out = len(following), []
+    for conditional in conditionals:
+        rhs = conditional[:, 2 * dim] - conditional[:, dim : 2 * dim] @ following
+        following, info = lapack.dtrtrs(conditional[:, :dim], rhs)
+        if info:
+            raise ArithmeticError("a keyframe is not determined by its factors")
+        out.append(following)
+    if not math.isfinite(following.sum()):  # what is not finite stays so
+        raise ArithmeticError("a keyframe is not determined by its factors")
+    return out
 
 
 def covariance_before(conditional: Array, following: Array) -> Array:
