@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -21,97 +20,54 @@ POINTS, SHARE, FACTOR = 1.0, 0.1, 2.0
 FILES = ("claims_tables.yaml", "claims_figures.yaml", "claims_rest.yaml")
 
 
-class Criterion(ABC):
-    """A rule for one measured quantity."""
+RULES = {"near": "within", "at_least": "at least", "at_most": "at most", "published": ""}
+"""Rules by their names in the files of claims, and how their limits are introduced."""
 
-    @abstractmethod
+
+@dataclass(frozen=True)
+class Criterion:
+    """A rule for the mean of one measured quantity over the runs.
+
+    "at_least" and "at_most" have two numbers: the limit of agreement, and that of agreement in part. "near"
+    has a target before them, from which the mean may be so far. "published" has a target alone, a mean of
+    the study's Tab. 4, which is one run of each: it is near the twin's mean, or among its single runs, which
+    counts only where chance moves them by more than a point.
+    """
+
+    rule: str
+    numbers: tuple[float, ...]
+
     def _holds(self, found: Spread) -> tuple[bool, bool]:
         """Whether the quantity agrees, and whether it does in part."""
+        if self.rule == "published":
+            (target,) = self.numbers
+            near = abs(found.mean - target) <= max(POINTS, SHARE * target)
+            scattered = found.runs > 1 and found.high - found.low > POINTS
+            among = scattered and found.low <= target <= found.high
+            return near or among, 1.0 / FACTOR <= found.mean / target <= FACTOR
+        *targets, agree, partly = self.numbers
+        value = abs(found.mean - targets[0]) if targets else found.mean
+        if self.rule == "at_least":
+            return value >= agree, value >= partly
+        return value <= agree, value <= partly
 
     def verdict(self, found: Spread) -> str:
         """One of `VERDICTS`; what could not be measured disagrees."""
         agrees, partly = self._holds(found)
         return AGREE if agrees else PARTLY if partly else DISAGREE
 
-    @abstractmethod
     def words(self, unit: str) -> str:
         """The rule in words."""
+        if self.rule == "published":
+            return (
+                f"±{POINTS:g} point or ±{100 * SHARE:g} %, or among single runs (partly: factor {FACTOR:g})"
+            )
+        agree, partly = (_number(limit, unit) for limit in self.numbers[-2:])
+        return f"{RULES[self.rule]} {agree}" + (f" (partly: {partly})" if partly != agree else "")
 
     def wanted(self, unit: str) -> str:
         """What the study says, short."""
-        return ""
-
-
-@dataclass(frozen=True)
-class Near(Criterion):
-    """The mean lies within `agree` of `target`; within `partly` it agrees in part."""
-
-    target: float
-    agree: float
-    partly: float
-
-    def _holds(self, found: Spread) -> tuple[bool, bool]:
-        return abs(found.mean - self.target) <= self.agree, abs(found.mean - self.target) <= self.partly
-
-    def words(self, unit: str) -> str:
-        return f"within {_limits(self.agree, self.partly, unit)}"
-
-    def wanted(self, unit: str) -> str:
-        return _number(self.target, unit)
-
-
-@dataclass(frozen=True)
-class AtLeast(Criterion):
-    """The mean is at least `agree`; at least `partly` agrees in part."""
-
-    agree: float
-    partly: float
-
-    def _holds(self, found: Spread) -> tuple[bool, bool]:
-        return found.mean >= self.agree, found.mean >= self.partly
-
-    def words(self, unit: str) -> str:
-        return f"at least {_limits(self.agree, self.partly, unit)}"
-
-
-@dataclass(frozen=True)
-class AtMost(Criterion):
-    """The mean is at most `agree`; at most `partly` agrees in part."""
-
-    agree: float
-    partly: float
-
-    def _holds(self, found: Spread) -> tuple[bool, bool]:
-        return found.mean <= self.agree, found.mean <= self.partly
-
-    def words(self, unit: str) -> str:
-        return f"at most {_limits(self.agree, self.partly, unit)}"
-
-
-@dataclass(frozen=True)
-class Published(Criterion):
-    """A mean of the study's Tab. 4, which is one run of each: near the twin's mean, or among its single runs.
-
-    A target inside the range of single runs counts only where chance moves them by more than a point.
-    """
-
-    target: float
-
-    def _holds(self, found: Spread) -> tuple[bool, bool]:
-        near = abs(found.mean - self.target) <= max(POINTS, SHARE * self.target)
-        scattered = found.runs > 1 and found.high - found.low > POINTS
-        among = scattered and found.low <= self.target <= found.high
-        return near or among, 1.0 / FACTOR <= found.mean / self.target <= FACTOR
-
-    def words(self, unit: str) -> str:
-        return f"±{POINTS:g} point or ±{100 * SHARE:g} %, or among single runs (partly: factor {FACTOR:g})"
-
-    def wanted(self, unit: str) -> str:
-        return _number(self.target, unit)
-
-
-def _limits(agree: float, partly: float, unit: str) -> str:
-    return _number(agree, unit) + (f" (partly: {_number(partly, unit)})" if partly != agree else "")
+        return _number(self.numbers[0], unit) if self.rule in ("near", "published") else ""
 
 
 def _number(value: float, unit: str) -> str:
@@ -162,9 +118,6 @@ class ClaimResult:
     why: str
 
 
-_RULES: dict[str, type] = {"near": Near, "at_least": AtLeast, "at_most": AtMost, "published": Published}
-
-
 def load_claims() -> tuple[Claim, ...]:
     """All claims, in the order of the study's tables and figures."""
     claims: list[Claim] = []
@@ -180,11 +133,11 @@ def _claim(row: dict[str, Any]) -> Claim:
     Raises:
         ValueError: it has no rule, or several.
     """
-    rules = [name for name in _RULES if name in row]
+    rules = [name for name in RULES if name in row]
     if len(rules) != 1:
         raise ValueError(f"the claim '{row.get('statement')}' has {len(rules)} rules")
     numbers = row.pop(rules[0])
-    criterion: Criterion = _RULES[rules[0]](*(numbers if isinstance(numbers, list) else [numbers]))
+    criterion = Criterion(rules[0], tuple(numbers) if isinstance(numbers, list) else (numbers,))
     return Claim(criterion=criterion, **row)
 
 
