@@ -6,6 +6,7 @@ shown where the repository keeps them; a link to any other file outside docs bec
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import posixpath
 import re
@@ -212,6 +213,16 @@ SECTIONS = {
 }
 
 
+def drawing() -> Any:
+    """The module beside this one, which mkdocs does not find by its name."""
+    spec = importlib.util.spec_from_file_location("drawing", Path(__file__).with_name("drawing.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def on_config(config: Any) -> Any:
     """The navigation: every page of each folder, after those that are made from the code."""
     nav: list[Any] = ["README.md"]
@@ -261,4 +272,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
             return words if words.startswith("`") else f"{words} (`{path}`)"
         return f"{match[1]}[{words}]({posixpath.relpath(inside, posixpath.dirname(source) or '.')}{anchor})"
 
+    markdown = re.sub(
+        r"```mermaid\n(.*?)```", lambda found: drawing().svg(found[1]), markdown, flags=re.DOTALL
+    )
     return re.sub(r"(!?)\[([^\[\]]+)\]\((?!https?:|mailto:|#)([^)#\s]+)(#[^)\s]*)?\)", link, markdown)

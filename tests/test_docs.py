@@ -132,6 +132,15 @@ def test_readme_is_short() -> None:
     assert 1 <= table.count("\n| ") - 2 <= 8
 
 
+def test_pages_are_few_words() -> None:
+    """All written pages together, without drawings and marks of figures."""
+    words = 0
+    for page in (ROOT / "docs").rglob("*.md"):
+        text = re.sub(r"```mermaid.*?```|<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        words += len(text.split())
+    assert words <= 40_000
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "img").iterdir())
     assert pictures

@@ -72,6 +72,19 @@ def test_schemas_and_effects_are_whole(site: Path) -> None:
             )
 
 
+def test_the_architecture_is_a_drawing(site: Path) -> None:
+    """Each package of the chart is a box with its name."""
+    page = (site / "explanation" / "architecture.html").read_text(encoding="utf-8")
+    names = re.findall(
+        r"^ +\w+\[(\w+)\]$", (ROOT / "docs/explanation/architecture.md").read_text("utf-8"), re.M
+    )
+    assert len(names) > 30
+    drawing = page[page.index("<svg viewBox") : page.index("</svg>", page.index("<svg viewBox"))]
+    assert drawing.count("<rect") >= len(names)
+    for name in names:
+        assert f">{name}</text>" in drawing, name
+
+
 def test_no_page_asks_anything_from_outside(site: Path) -> None:
     """Links may lead out; scripts, styles, pictures and fonts lie in the site."""
     asking = re.compile(r"<(?:script|img|iframe|source)\b[^>]*?src=[\"']?(?:https?:)?//[^\"' >]*")

@@ -40,7 +40,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "outage_terms", "known_changes", "grounds", "fault_matrix", "coarse_slides",
+    "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix", "coarse_slides",
 )  # fmt: skip
 
 
@@ -76,6 +76,33 @@ STUDIES = (
             "field_logs_changed": r"field logs \d+, of which a repair would change (\d+)",
             "runs_changed": r"simulated runs \d+, of which a repair would change (\d+)",
         },
+    ),
+    Study(
+        "first_hour",
+        "How long is each step of the first hour, does it work after `pip install .`, and how large is it?",
+        _module("first_hour"),
+        6,
+        {
+            **{
+                f"{step}_s": rf"{step} +[\d.]+ +([\d.]+)"
+                for step in ("install", "help", "self_check", "demo", "inspect", "replay", "python", "init")
+            },
+            "installed_mb": r"installed (\d+) MB",
+            "failed": r"steps that failed: (\d+)",
+        },
+    ),
+    Study(
+        "ice_picture",
+        "What does a real robot on ice do without GNSS, with fixed and with adaptive weights?",
+        _module("ice_picture", "--out", OUT),
+        4,
+        {
+            "drives": r"median of (\d+)",
+            "fixed_m": r"median of \d+: fixed ([\d.]+)",
+            "adaptive_m": r"median of \d+: .*adaptive ([\d.]+) m",
+            "won": r"median of .*adaptive better in (\d+)",
+        },
+        picture="ice_picture.png",
     ),
     Study(
         "fuzz",
