@@ -370,6 +370,10 @@ STUDIES = (
         "What do adaptive weights gain over fixed and other baselines, in pairs of the same drives?",
         ("terrafusion", "benchmark", "--out", OUT),
         300,
+        {
+            f"{family}_{plant}_over_fixed": rf"\| {family}, {plant} (?:\|[^|]*){{5}}\| ([^|]+?) \|"
+            for family, plant in (("mixed", "twin"), ("mixed", "second"), ("unseen", "second"))
+        },
         picture="ratios.png",
     ),
     Study(
