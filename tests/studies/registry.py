@@ -412,8 +412,6 @@ STUDIES = (
             "7",
             "--jobs",
             "2",
-            "--minutes",
-            "26",
             "--out",
             OUT,
         ),

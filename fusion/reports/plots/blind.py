@@ -45,6 +45,7 @@ def plot_power(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
             _rates(ax, x, list(cells.values()), fmt=f"o{dash}", color=METHOD_COLOURS[method], label=label)
             shift *= 1.02
     ax.set_xscale("log")
+    ax.minorticks_off()
     ax.set_xticks([5, 10, 25], ["5", "10", "25"])
     ax.set_ylim(-0.03, 1.05)
     ax.legend(fontsize=7, frameon=False, loc="lower right")
@@ -60,8 +61,7 @@ def plot_alarms(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
         rates, at = list(figures["false_alarms"].values()), np.arange(len(names)) + 0.2 * k
         _rates(ax, at, rates, fmt="o", color=METHOD_COLOURS[method], label=method)
     ax.axhline(0.05, color=style.NEUTRAL, linewidth=0.8, linestyle=":")
-    ax.set_ylim(-0.03, 1.05)
-    ax.legend(fontsize=7, frameon=False, loc="upper left")
+    _legend_above(ax)
     style.format_axes(ax, y="share of trials without effect", title="False alarms (dotted: target)")
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right")
     ax.tick_params(axis="x", labelsize=7)
@@ -76,8 +76,7 @@ def plot_named(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
         rates = [figures[name][family] for name in NAMED for family in DASHES]
         at = np.arange(len(rates)) + 0.2 * k
         _rates(ax, at, rates, fmt="o", color=METHOD_COLOURS[method], label=method)
-    ax.set_ylim(-0.03, 1.05)
-    ax.legend(fontsize=7, frameon=False, loc="lower left")
+    _legend_above(ax)
     style.format_axes(ax, y="share of detected trials", title="Named")
     ax.set_xticks(range(len(labels)), labels)
     ax.tick_params(axis="x", labelsize=7)
@@ -128,3 +127,10 @@ def _rates(ax: Axes, x: Any, rates: Sequence[Mapping[str, Any]], **options: Any)
     y = np.array([r["rate"] if r["rate"] is not None else np.nan for r in rates])
     bars = np.array([[v - r["low"], r["high"] - v] for v, r in zip(y, rates, strict=True)]).T
     ax.errorbar(x, y, yerr=np.maximum(bars, 0.0), markersize=4, linewidth=1.2, capsize=2, **options)
+
+
+def _legend_above(ax: Axes) -> None:
+    """Shares from 0 to 1, and room for the legend over them."""
+    ax.set_ylim(-0.03, 1.2)
+    ax.set_yticks(np.linspace(0.0, 1.0, 6))
+    ax.legend(fontsize=7, frameon=False, loc="upper left", ncol=2)
