@@ -37,7 +37,7 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
         "opponent",
     ):
         assert words in page
-    assert "http" not in page
+    assert "://" not in page
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
     told = summary(scores)
     assert any(
