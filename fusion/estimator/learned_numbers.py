@@ -55,7 +55,7 @@ MOST_SPREAD = 0.1
 LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
 """Fixes later than this can look like a slide; the delay explains them if they then lie within about three of
 their sigma: a slide leaves a hundred and more (assumed)."""
-CLEAR_SIGMA, STILL_CLEAR = 5.0, 0.5
+CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
 
