@@ -1,0 +1,177 @@
+"""Do the tests notice when a number or an operator of the core is changed?
+
+    python -m tests.studies.mutation --mutants 40 --out OUT
+
+A mutant is a module with one change: a comparison, an operator, a sign or a number. They are drawn at random
+with a seed; each is imported in a child process in place of the module, and the tests of that module are run
+until one fails. A mutant that none notices survives, and is printed with its line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import importlib
+import importlib.abc
+import importlib.util
+import io
+import json
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tests.datasets.fuzz import cpu_s
+
+ROOT = Path(__file__).parents[2]
+TARGETS = {
+    "fusion/graph/wheel_factor.py": ("tests/fusion/graph", "tests/gtsam_factors.py"),
+    "fusion/graph/gnss_factor.py": ("tests/fusion/graph",),
+    "fusion/metrics/consistency.py": ("tests/fusion/metrics/test_consistency.py",),
+    "fusion/metrics/verdict.py": ("tests/fusion/metrics/test_verdict.py",),
+    "fusion/weighting/weighting.py": ("tests/fusion/weighting",),
+    "fusion/weighting/innovation.py": ("tests/fusion/weighting",),
+    "fusion/inputs/door.py": ("tests/fusion/inputs",),
+    "fusion/inputs/gyro_unit.py": ("tests/fusion/inputs/test_gyro_unit.py",),
+}
+LONGEST_CPU_S, LONGEST_S = 120.0, 900.0
+HEAVY = ("gtsam", "scipy.stats", "scipy.optimize", "hypothesis")
+"""What tests import beside the library; it is in memory before the first child starts."""
+PAIRS = (
+    (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.Lt, ast.GtE), (ast.LtE, ast.Gt), (ast.Eq, ast.NotEq),
+    (ast.And, ast.Or), (ast.Is, ast.IsNot),
+)  # fmt: skip
+SWAPPED: dict[type, type] = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
+
+
+def places(tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
+    """Nodes that can be changed, and which change."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPPED:
+            yield node, "comparison"
+        elif isinstance(node, (ast.BinOp, ast.BoolOp)) and type(node.op) in SWAPPED:
+            yield node, "operator"
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.Not)):
+            yield node, "sign"
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            yield node, "number"
+
+
+def mutant(source: str, number: int) -> tuple[str, int, str]:
+    """The source with its change `number`, the line, and the line as it becomes."""
+    tree = ast.parse(source)
+    node, kind = list(places(tree))[number]
+    if kind == "comparison":
+        assert isinstance(node, ast.Compare)
+        node.ops[0] = SWAPPED[type(node.ops[0])]()
+    elif kind == "operator":
+        assert isinstance(node, (ast.BinOp, ast.BoolOp))
+        node.op = SWAPPED[type(node.op)]()  # type: ignore[assignment]
+    elif kind == "sign":
+        assert isinstance(node, ast.UnaryOp)
+        node.op = ast.UAdd() if isinstance(node.op, ast.USub) else ast.Not()
+        if isinstance(node.op, ast.Not):
+            node.operand = ast.UnaryOp(ast.Not(), node.operand)
+    else:
+        assert isinstance(node, ast.Constant)
+        node.value = node.value + 1 if type(node.value) is int else node.value * 2.0 + 0.1
+    ast.fix_missing_locations(tree)
+    return ast.unparse(tree), node.lineno, ast.unparse(node)  # type: ignore[attr-defined]
+
+
+class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports one module from another source."""
+
+    def __init__(self, name: str, source: str, file: Path) -> None:
+        self.name, self.source, self.file = name, source, file
+
+    def find_spec(self, name: str, path: object, target: object = None) -> object:
+        if name != self.name:
+            return None
+        return importlib.util.spec_from_loader(name, self, origin=str(self.file))
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__file__ = str(self.file)
+        exec(compile(self.source, str(self.file), "exec"), module.__dict__)
+
+
+def outcome(target: str, source: str, tests: Sequence[str]) -> str:
+    """ "killed", "survived" or "hangs" (which is noticed, too)."""
+    child = os.fork()
+    if child == 0:
+        status = 70
+        try:
+            name = "terrafusion." + target.removesuffix(".py").replace("/", ".")
+            sys.meta_path.insert(0, _Mutated(name, source, ROOT / target))
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                arguments = ["-q", "-x", "-p", "no:cacheprovider", *(str(ROOT / test) for test in tests)]
+                status = int(pytest.main(arguments))
+        finally:
+            os._exit(status)
+    until = time.monotonic() + LONGEST_S
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return "survived" if os.waitstatus_to_exitcode(status) == 0 else "killed"
+        if cpu_s(child) > LONGEST_CPU_S or time.monotonic() > until:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return "hangs"
+        time.sleep(0.02)
+
+
+def run(count: int, seed: int, out: Path, targets: Sequence[str]) -> list[dict[str, object]]:
+    """Try `count` mutants of each target; what is in `out` is not done again."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "mutants.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    done = {(row["target"], row["number"]) for row in rows}
+    for target in targets:
+        source = (ROOT / target).read_text(encoding="utf-8")
+        total = len(list(places(ast.parse(source))))
+        drawn = np.random.default_rng(seed).permutation(total)[:count].tolist()
+        for number in drawn:
+            if (target, number) in done:
+                continue
+            changed, line, becomes = mutant(source, number)
+            row = {"target": target, "number": number, "line": line, "becomes": becomes}
+            row["outcome"] = outcome(target, changed, TARGETS[target])
+            rows.append(row)
+            with file.open("a", encoding="utf-8") as kept:
+                kept.write(json.dumps(row) + "\n")
+    return rows
+
+
+def main() -> None:
+    """Print the score of each module, and what survived."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--mutants", type=int, default=40, help="of each module")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--targets", nargs="*", default=list(TARGETS))
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    for name in HEAVY:
+        importlib.import_module(name)
+    rows = run(given.mutants, given.seed, given.out, given.targets)
+    print("| module | mutants | noticed | survived |\n| --- | --- | --- | --- |")
+    for target in given.targets:
+        count = Counter(row["outcome"] for row in rows if row["target"] == target)
+        alive = count["survived"]
+        print(f"| {target} | {count.total()} | {count.total() - alive} | {alive} |")
+    survived = [row for row in rows if row["outcome"] == "survived"]
+    print(f"\nmutants {len(rows)}, noticed {len(rows) - len(survived)}\n")
+    for row in survived:
+        print(f"- {row['target']}:{row['line']} becomes `{row['becomes']}`")
+
+
+if __name__ == "__main__":
+    main()
