@@ -55,6 +55,11 @@ def machine() -> str:
     return hashlib.sha256("".join(known).encode()).hexdigest()[:8]
 
 
+def is_part(name: str) -> bool:
+    """Whether the name of an entry says that it is work in progress, or what a killed process left of it."""
+    return name.startswith(PREFIX) or name.endswith(".part")
+
+
 def sweep(folder: Path, prefix: str) -> None:
     """Remove what killed processes left: entries named `prefix`, process id, `machine()`, more.
 

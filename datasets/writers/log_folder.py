@@ -17,7 +17,7 @@ from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED, scratch_folder, sweep
+from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED, is_part, scratch_folder, sweep
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
@@ -72,7 +72,7 @@ def _check_room(folder: Path) -> None:
         if folder.exists() and not folder.is_dir():
             raise DataError("is a file", file=folder, remedy="give a folder to write the log into")
         found = folder.iterdir() if folder.is_dir() else ()
-        if any(not path.name.startswith(PREFIX) for path in found) and not (folder / META).is_file():
+        if not all(is_part(path.name) for path in found) and not (folder / META).is_file():
             raise DataError(
                 "the folder is not empty and holds no log", file=folder, remedy="give an empty or new folder"
             )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder, expanded
-from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED
+from terrafusion.datasets.core.scratch import UNFINISHED, is_part
 
 ROOT = Path("terrafusion-out")
 LOG_FILES = ("meta.yaml", "*.csv", "*.csv.gz")
@@ -83,11 +83,6 @@ def default_name(command: str, subject: str, suffix: str = "") -> Path:
         if not path.exists():
             return path
         begun += 1.0
-
-
-def is_part(name: str) -> bool:
-    """Whether an entry is work in progress, or what a killed process left of it."""
-    return name.startswith(PREFIX) or name.endswith(".part")
 
 
 def parts_of(out: Path) -> Path:

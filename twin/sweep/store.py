@@ -17,6 +17,7 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.files import unwritable, write_atomically
+from terrafusion.datasets.core.scratch import is_part
 from terrafusion.twin.model.version import model_sha256, version
 from terrafusion.twin.sweep.plan import Sweep
 from terrafusion.twin.sweep.rows import Row, columns
@@ -78,7 +79,7 @@ class Store:
     def _check_same(self) -> None:
         about = self.folder / SWEEP_FILE
         if not about.is_file():
-            if self.folder.is_dir() and any(self.folder.iterdir()):
+            if self.folder.is_dir() and not all(is_part(path.name) for path in self.folder.iterdir()):
                 raise ConfigError(
                     "the folder is not empty and holds no sweep", file=self.folder, remedy="give a new folder"
                 )

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
+from terrafusion.datasets.core.scratch import machine
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.sweep import run as module
 from terrafusion.twin.sweep.load import load_sweep
@@ -206,6 +207,14 @@ def test_a_folder_with_other_things_is_left_alone(file: Path, tmp_path: Path) ->
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
     with pytest.raises(ConfigError, match="not empty and holds no sweep"):
         run_sweep(load_sweep(file), tmp_path / "out")
+
+
+def test_what_a_sweep_killed_at_its_begin_left_is_no_other_thing(file: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    part = tmp_path / "out" / f".sweep.json.{2**22 + 1}.{machine()}.part"
+    part.write_text("{")
+    run_sweep(load_sweep(file), tmp_path / "out")
+    assert not part.exists()
 
 
 def test_too_many_runs_are_refused_unless_asked_for(file: Path, tmp_path: Path) -> None:
