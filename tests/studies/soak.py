@@ -15,8 +15,10 @@ import dataclasses
 import itertools
 import multiprocessing
 import os
+import sys
 import time
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -100,8 +102,8 @@ class Soak:
     end_s: list[float] = field(default_factory=list)
     used_mb: list[float] = field(default_factory=list)
     dump_kb: list[float] = field(default_factory=list)
-    at_s: list[float] = field(default_factory=list)
-    cpu_ms: list[float] = field(default_factory=list)
+    at_s: Sequence[float] = field(default_factory=lambda: array("f"))
+    cpu_ms: Sequence[float] = field(default_factory=lambda: array("f"))
 
     def p99_ms(self, begin_s: float, end_s: float) -> float:
         """99th percentile of the computing times of a window."""
@@ -138,7 +140,8 @@ def soak(seconds: float, calibrate: bool, scenario: str = SCENARIO) -> Soak:
     estimator = Estimator(
         EstimatorConfig(vehicle.rig(), vehicle.name, calibrate=calibrate, grounds=GroundMemory())
     )
-    found, begin_ns = Soak(), recording.start_ns
+    at_s, cpu_ms = array("f"), array("f")  # lists of floats would grow by 3 MB an hour
+    found, begin_ns = Soak(at_s=at_s, cpu_ms=cpu_ms), recording.start_ns
     for again in repeated(recording):
         for message in again.messages():
             before, begun = estimator.latest(), time.thread_time()
@@ -148,12 +151,13 @@ def soak(seconds: float, calibrate: bool, scenario: str = SCENARIO) -> Soak:
                 estimator.odometry()
             # The call that starts the estimator makes all keyframes that waited for it.
             if before is not None and estimator.latest() is not before:
-                found.at_s.append((message.t_ns - begin_ns) * 1e-9)
-                found.cpu_ms.append(spent * 1e3)
+                at_s.append((message.t_ns - begin_ns) * 1e-9)
+                cpu_ms.append(spent * 1e3)
         assert again.imu is not None
         found.end_s.append((int(again.imu.t_ns[-1]) - begin_ns) * 1e-9)
         found.used_mb.append(resident_mb())
         found.dump_kb.append(len(estimator.dump()) * 1e-3)
+        print(f"{found.end_s[-1] / 3600.0:.2f} h: {found.used_mb[-1]:.1f} MB", file=sys.stderr, flush=True)
         if found.end_s[-1] >= seconds:
             break
     if not found.cpu_ms:
