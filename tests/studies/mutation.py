@@ -110,9 +110,12 @@ def outcome(target: str, source: str, tests: Sequence[str]) -> str:
         status = 70
         try:
             name = "terrafusion." + target.removesuffix(".py").replace("/", ".")
+            for loaded in [one for one in sys.modules if one.startswith(("terrafusion.", "tests."))]:
+                del sys.modules[loaded]
             sys.meta_path.insert(0, _Mutated(name, source, ROOT / target))
             with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                arguments = ["-q", "-x", "-p", "no:cacheprovider", *(str(ROOT / test) for test in tests)]
+                quiet = ["-W", "ignore::pytest.PytestAssertRewriteWarning", "-p", "no:cacheprovider"]
+                arguments = ["-q", "-x", *quiet, *(str(ROOT / test) for test in tests)]
                 status = int(pytest.main(arguments))
         finally:
             os._exit(status)
@@ -120,7 +123,10 @@ def outcome(target: str, source: str, tests: Sequence[str]) -> str:
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
-            return "survived" if os.waitstatus_to_exitcode(status) == 0 else "killed"
+            code = os.waitstatus_to_exitcode(status)
+            if code > 2:  # neither tests that fail nor modules that cannot be imported
+                raise RuntimeError(f"{target}: pytest ended with {code}")
+            return "survived" if code == 0 else "killed"
         if cpu_s(child) > LONGEST_CPU_S or time.monotonic() > until:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
