@@ -14,6 +14,7 @@ from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
+from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 Array = NDArray[np.float64]
 _SIGMAS = (
@@ -199,6 +200,8 @@ def _shade_terrain(plot: Plot, estimate: Estimate, t_s: Array) -> None:
         return
     rows = style.thin(len(t_s), 600)
     label, t_s = estimate.dominant_terrain()[rows], t_s[rows]
+    if (label == UNKNOWN).all():
+        return
     runs = style.runs_of(label)
     strips: dict[str, list[tuple[float, float]]] = {}
     for first, last in runs:

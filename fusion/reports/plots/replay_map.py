@@ -21,6 +21,7 @@ from terrafusion.fusion.reports.plots.ellipses import (
     rejected_fixes,
 )
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
+from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 Array = NDArray[np.float64]
 MOST = 2 * style.MAX_POINTS
@@ -101,6 +102,8 @@ def _ground(plot: Plot, estimate: Estimate) -> None:
     if len(xy) < 2 or not estimate.classes:
         return
     label = estimate.dominant_terrain()[rows]
+    if (label == UNKNOWN).all():
+        return
     lines: dict[str, list[Array]] = {}
     for first, last in style.runs_of(label):
         lines.setdefault(str(label[first]), []).append(xy[first : last + 1])

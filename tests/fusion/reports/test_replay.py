@@ -33,6 +33,7 @@ from terrafusion.fusion.reports.plots.style import colour_of, label_text, thin
 from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.fusion.reports.replay_text import ScoreRow, pick_pair, score_rows, summary_of_many
 
+CLASSES = ("asphalt", "loose_sand", "mud", "unknown")
 COLOURS = {"adaptive": "#0072b2", "fixed": "#d55e00", "a": "#0072b2"}
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
 OUTAGES = (Outage(40.0, 30.0),)
@@ -296,6 +297,21 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
         plots_map.plot_map(sheet, runs, "a", recording, COLOURS, errors={}, held_out=none, outages=OUTAGES)
         page = json.loads(sheet.json())  # JSON itself knows no NaN
         assert len(page["render"][0]["roots"]) == len(sheet.panels)
+
+
+def test_a_ground_that_nothing_tells_colours_nothing(drive):
+    d = drive(seconds=20.0)
+    known = np.zeros_like(d.estimate.terrain)
+    known[:, CLASSES.index("unknown")] = 1.0
+    blank = dataclasses.replace(d.estimate, terrain=known)
+    entries = []
+    for estimate in (d.estimate, blank):
+        sheet = Sheet(20.0)
+        plots.plot_slip(sheet, {"a": estimate}, "a", d.recording.start_ns, COLOURS)
+        plots_map.plot_map(sheet, {"a": estimate}, "a", d.recording, COLOURS, errors={})
+        entries.append({label for panel in sheet.panels.values() for label in panel.legend})
+    assert "on loose_sand" in entries[0]
+    assert not {"unknown", "on unknown"} & entries[1]
 
 
 def test_single_precision_is_used_only_where_it_is_exact_enough():
