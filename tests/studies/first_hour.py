@@ -99,7 +99,7 @@ def main() -> int:
             took = run([str(env / "bin" / words[0]), *words[1:]], folder)
             lines.append(f"{name:18s} {took.clock_s:9.1f} {took.processor_s:14.1f}")
             failed += took.status != 0
-            printed = took.printed.strip().splitlines()
+            printed = took.printed.replace(str(Path.home()), "~").strip().splitlines()
             more = ["..."] if len(printed) > SCREEN_LINES else []
             screens += ["", f"$ {command}", *(line[:118] for line in printed[:SCREEN_LINES]), *more]
         print("\n".join(lines))
