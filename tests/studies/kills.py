@@ -55,7 +55,7 @@ axes:
 """
 COMMANDS: dict[str, tuple[str, ...]] = {
     "simulate": ("simulate", "drive.yaml", "--out", "out/run"),
-    "simulate to mcap": ("simulate", "drive.yaml", "--out", "out/run.mcap"),
+    "simulate to mcap": ("simulate", "drive.yaml", "--out", "out/run.mcap", "--force"),
     "convert": ("convert", "log", "out/log", "--force"),
     "replay": ("replay", "log", "--mode", "fixed", "--out", "out/run"),
     "sweep": ("sweep", "slopes.yaml", "--out", "out/run", "--jobs", "1", "--recordings", "3"),
@@ -72,6 +72,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 RERUN_EVERY, INTERRUPT_EVERY = 5, 5
 LONGEST_S = 900.0
 """Time after which a command hangs, on a busy machine."""
+NOT_TRIED = 72
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 FILE_EVENTS = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.chmod", "shutil.rmtree")
 
@@ -118,6 +119,9 @@ def started(
         if trouble is not None:
             trouble()
         status = _main(words)
+    except NotTried:
+        status = NOT_TRIED
+    else:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
@@ -342,26 +346,27 @@ def full_disk() -> None:
 
 
 def read_only() -> None:
-    """The folder for results may not be written."""
+    """The folder for results may not be written; what is written as root is not tried."""
     Path("out").chmod(0o500)
-    as_nobody()
-
-
-def as_nobody() -> None:
-    """A user without rights, where this process may become one."""
     if os.getuid() == 0:
-        Path("tmp").chmod(0o777)
-        os.setgid(54321)
-        os.setuid(54321)
+        raise NotTried
+
+
+class NotTried(Exception):  # noqa: N818
+    """A trouble that cannot be made here."""
 
 
 def no_home() -> None:
     """Neither a home folder nor an entry for the user."""
-    for path in (Path("out"), Path("tmp")):
-        path.chmod(0o777)
+    import pwd
+
     for name in ("HOME", "USER", "LOGNAME", "XDG_CACHE_HOME", "TERRAFUSION_CACHE"):
         os.environ.pop(name, None)
-    as_nobody()
+
+    def unknown(_: int) -> pwd.struct_passwd:
+        raise KeyError("no such user")
+
+    pwd.getpwuid = unknown
 
 
 def no_compiler() -> None:
@@ -411,6 +416,8 @@ def troubled(name: str, work: Path, trouble: Callable[[], None]) -> str:
     out.mkdir()
     end = ended(started(COMMANDS[name], work, trouble=trouble), work)
     out.chmod(0o700)
+    if end.status == NOT_TRIED:
+        return "not tried"
     if end.status and not end.refused_in_one_line():
         return f"odd end {end.status}: {end.err.strip()[-200:]}"
     if bad := half_files(out, work / "reference"):
@@ -418,6 +425,9 @@ def troubled(name: str, work: Path, trouble: Callable[[], None]) -> str:
     if end.status == 0 and names_in(out) != names_in(work / "reference"):
         return "other files"
     return "refused" if end.status else "works"
+
+
+TWO = "two at once"
 
 
 def two_at_once(name: str, work: Path) -> str:
@@ -458,12 +468,17 @@ def main() -> None:
     work, kept = prepared(given.out.absolute() / "work"), given.out / "rows.json"
     rows = json.loads(kept.read_text()) if kept.is_file() else {}
     for name in given.commands:
-        if name not in rows:
-            count = killed(name, work, given.kills)
-            rows[name] = {"count": count, "troubles": {}}
-            for what, trouble in TROUBLES.items():
-                rows[name]["troubles"][what] = troubled(name, work, trouble)
-            rows[name]["troubles"]["two at once"] = two_at_once(name, work)
+        row = rows.setdefault(name, {"troubles": {}})
+        if "count" not in row:
+            row["count"] = killed(name, work, given.kills)
+            kept.write_text(json.dumps(rows))
+        if missing := [what for what in (*TROUBLES, TWO) if what not in row["troubles"]]:
+            reference_run(COMMANDS[name], work)
+            for what in missing:
+                two = what == TWO
+                row["troubles"][what] = (
+                    two_at_once(name, work) if two else troubled(name, work, TROUBLES[what])
+                )
             kept.write_text(json.dumps(rows))
     print(table(rows))
 
@@ -477,14 +492,14 @@ def table(rows: dict[str, dict[str, dict[str, str | int]]]) -> str:
     total = sum(counts.values(), Counter[str]())
     lines = [f"kills {total['kills']}", f"defects {sum(total[what] for what in BAD)}"]
     troubles = [told for row in rows.values() for told in row["troubles"].values()]
-    odd = [told for told in troubles if told not in ("works", "refused")]
+    odd = [told for told in troubles if told not in ("works", "refused", "not tried")]
     lines += [f"troubles {len(troubles)}", f"troubles that end oddly {len(odd)}", ""]
     names = ("kills", "ended before", "reruns", *BAD)
     lines += ["| command | " + " | ".join(names) + " |", "| --- " * (len(names) + 1) + "|"]
     lines += [
         f"| {name} | " + " | ".join(str(count[n]) for n in names) + " |" for name, count in counts.items()
     ]
-    columns = (*TROUBLES, "two at once")
+    columns = (*TROUBLES, TWO)
     lines += ["", "| command | " + " | ".join(columns) + " |", "| --- " * (len(columns) + 1) + "|"]
     lines += [
         f"| {name} | " + " | ".join(str(row["troubles"][c]) for c in columns) + " |"
