@@ -25,7 +25,8 @@ from terrafusion.twin.simulate import simulate
 
 GROUNDS = ("asphalt", "grass", "gravel", "medium_sand", "loose_sand", "mud")
 VEHICLES = ("elevate", "husky", "generic")
-FIRST_SEED = 400
+FIRST_SEED, JUDGED_SEED = 400, 500
+"""Rules of the verdict were set on seeds from the first on; those from the second on only judge them."""
 
 
 def short_drive(seed: int) -> Recording:
@@ -120,15 +121,17 @@ def main() -> None:
     """Print one line a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=36)
+    parser.add_argument("--judged", action="store_true", help="Take the seeds that only judge.")
     parser.add_argument("--faults", nargs="*", default=list(FAULTS))
     parser.add_argument("--reasons", action="store_true", help="Also print why drives are not good.")
     parser.add_argument("--plain", action="store_true", help="Without self-calibration.")
     given = parser.parse_args()
+    first = JUDGED_SEED if given.judged else FIRST_SEED
     settings: EstimatorOptions = {"self_calibrate": False} if given.plain else {}
     print(f"{'fault':28s} judged with  good  doubtful  not to be used  wrong  wrong and good")
     for name in given.faults:
         for with_truth in (True, False):
-            logs = (FAULTS[name](short_drive(FIRST_SEED + i)) for i in range(given.seeds))
+            logs = (FAULTS[name](short_drive(first + i)) for i in range(given.seeds))
             rows = [judged(log, with_truth, settings) for log in logs]
             values = Counter(value for value, _, _ in rows)
             wrong = [value for value, bad, _ in rows if bad]
@@ -139,7 +142,7 @@ def main() -> None:
                 for i, (value, bad, reasons) in enumerate(rows):
                     if value != GOOD or bad:
                         print(
-                            f"    {FIRST_SEED + i} {value} {'wrong' if bad else ''}: {' | '.join(reasons)}",
+                            f"    {first + i} {value} {'wrong' if bad else ''}: {' | '.join(reasons)}",
                             flush=True,
                         )
 
