@@ -11,7 +11,6 @@ from terrafusion.fusion.benchmark.estimator_gap import Compared
 from terrafusion.fusion.reports.gap_text import either, numbers, percent, sections, verdict_line
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
-from terrafusion.twin.gap.answer.credible_sets import credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.verdict import LEAST_PROBABILITY
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
@@ -77,7 +76,7 @@ def _causes(d: GapDiagnosis) -> list[list[str]]:
 
 
 def _sets(d: GapDiagnosis) -> list[list[str]]:
-    return [[either(s), percent(s.probability), "yes" if s.named else "no"] for s in credible_sets(d.verdict)]
+    return [[either(s), percent(s.probability), "yes" if s.named else "no"] for s in d.verdict.sets]
 
 
 def _drives(d: GapDiagnosis) -> list[str]:

@@ -7,10 +7,9 @@ import textwrap
 from pathlib import Path
 
 from terrafusion.fusion.reports.explain_effect import effect_words
-from terrafusion.twin.gap.answer.credible_sets import CredibleSet, credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
-from terrafusion.twin.gap.answer.verdict import Cause
+from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet
 from terrafusion.twin.gap.answer.where import LEAST_REFERENCES, GapCell
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 
@@ -79,7 +78,7 @@ def verdict_line(d: GapDiagnosis) -> str:
 
 def named_sets(d: GapDiagnosis) -> list[CredibleSet]:
     """Credible sets of the named effects."""
-    return [s for s in credible_sets(d.verdict) if s.named]
+    return [s for s in d.verdict.sets if s.named]
 
 
 def place_words(cell: GapCell) -> str:

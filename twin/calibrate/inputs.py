@@ -42,6 +42,7 @@ class TwinInput:
         follows: whether they are measured speeds that the wheels follow, not commands.
         gaps: (G, 2) stretches without input, s.
         notes: what was assumed.
+        step_s: time between two commands; 0 for measured speeds.
     """
 
     start_ns: int
@@ -49,6 +50,7 @@ class TwinInput:
     follows: bool
     gaps: Array
     notes: tuple[str, ...]
+    step_s: float = 0.0
 
     def end_s(self) -> float:
         """Time of the last sample, s."""
@@ -137,7 +139,7 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
     notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
              "them is not compared, the last command is held"] if len(gaps) else []  # fmt: skip
-    return TwinInput(start, sides, False, gaps, tuple(notes))
+    return TwinInput(start, sides, False, gaps, tuple(notes), min(sample_interval_s(t_s), LONGEST_GAP_S))
 
 
 def _gaps(t_s: Array) -> Array:

@@ -36,6 +36,8 @@ class PreparedLog:
         observed: the channels.
         posed: whether the log determines the heading.
         notes: what was assumed, in sentences.
+        input_step_s: time between two commands, between which a change may lie anywhere; 0 where the wheels
+            are followed.
     """
 
     name: str
@@ -48,6 +50,7 @@ class PreparedLog:
     observed: tuple[Observed, ...]
     posed: bool
     notes: tuple[str, ...]
+    input_step_s: float = 0.0
 
     def seconds(self) -> float:
         """Length of what is compared, s."""
@@ -101,7 +104,7 @@ def prepare(
         notes.append("on a slope, and nothing in the log determines the heading: taken as 0 at the start")
     return PreparedLog(
         recording.name, given.sides, given.follows, labels, borders, windows, start, observed, posed,
-        tuple(notes),
+        tuple(notes), given.step_s,
     )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ class Observed:
         least: lower bound of the learnt noise, as a share of `sigma`.
         correlation: share of the variance that is correlated in time, and its time constant in s,
             where a data sheet gives it; None: it is estimated.
+        timing: (n,) 1 sigma by the unknown time of changes of the input, beside the noise; None: none.
     """
 
     channel: str
@@ -55,6 +56,7 @@ class Observed:
     slot_s: float
     least: float
     correlation: tuple[float, float] | None = None
+    timing: Array | None = None
 
     def select(self, rows: NDArray[np.bool_]) -> Observed:
         """The rows of a mask."""

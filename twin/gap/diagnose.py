@@ -6,7 +6,6 @@ data -> rollout -> null -> infer -> answer
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -18,24 +17,17 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.drives import drive_coverage
-from terrafusion.twin.gap.answer.effect_search import EffectSearch
-from terrafusion.twin.gap.answer.next_run import next_run
+from terrafusion.twin.gap.answer.next_run import Planner
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
 from terrafusion.twin.gap.answer.verdict import judge
 from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import Soils, check_distinct
-from terrafusion.twin.gap.infer.candidate_selection import select_and_refit
-from terrafusion.twin.gap.infer.channels import ChannelTable
-from terrafusion.twin.gap.infer.detect import detect
-from terrafusion.twin.gap.infer.discrepancy import discrepancy_of
-from terrafusion.twin.gap.infer.nonlinear_refit import NonlinearRefit
-from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets, p_value_of_drive
-from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.infer.explain import explain
+from terrafusion.twin.gap.infer.other_drives import FEWEST, detect, learn_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.null.null import learn_null
 from terrafusion.twin.gap.null.score import REPLICATES, Score, learn_state_sigma, replicates, score
-from terrafusion.twin.gap.rollout.residuals import WhitenedRun, initial_state_sigma
+from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -43,6 +35,13 @@ from terrafusion.twin.model.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
+MANY_REFERENCES, STRICTER = 10, 0.2
+"""With fewer references, on drives unlike theirs, the p-value must be below such a share of the significance
+(assumed): how a run scatters is then hardly known."""
+TOO_FEW = (
+    "{} reference run(s) are too few, {} show how runs scatter: twin replicates stand in, and false alarms "
+    "are as frequent as the twin is wrong (uncalibrated)"
+)
 
 
 @one_blas_thread()
@@ -105,66 +104,44 @@ def diagnose_evidence(
     progress: Callable[[float], None] | None = None,
 ) -> GapDiagnosis:
     """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
-    began, candidates, runs = time.perf_counter(), evidence.candidates, evidence.runs
+    began, candidates, runs, notes = (
+        time.perf_counter(),
+        evidence.candidates,
+        evidence.runs,
+        list(evidence.notes),
+    )
     # null: how scores scatter where nothing has changed
     sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
-    scores = [_score_with_discrepancy(evidence, sigma, run) for run in runs]
+    scores = [score(run, sigma) for run in runs]
     normal = [score(run, sigma) for run in evidence.references]
-    uncalibrated = math.comb(len(runs) + len(normal), len(runs)) < 1.0 / significance
-    notes = list(evidence.notes)
+    uncalibrated = len(normal) < FEWEST
     if uncalibrated:
-        notes.append(_too_few(len(normal), len(runs), significance))
+        notes.append(TOO_FEW.format(len(normal), FEWEST))
         normal = _with_replicates(evidence, sigma, normal, seed)
-    null = learn_null(normal, len(scores))
-    # infer: is there a gap, and what remains of it with each effect in the twin
-    detection = detect(scores, normal, candidates, seed, evidence.jobs)
-    if detection.p_value <= significance and len(evidence.references) >= FEWEST:
-        # A drive that no reference made is always the odd one out: it must be unusual for the robot, too.
-        offsets = learn_offsets([score(run, sigma) for run in evidence.references], len(candidates.keys))
-        unusual = p_value_of_drive(scores, offsets, candidates, seed)
-        detection = dataclasses.replace(detection, p_value=max(detection.p_value, unusual))
-    pooled = PooledScores.of(scores, null).with_scatter(detection.typical, detection.scatter)
-    keys = len(candidates.keys)
-    table = ChannelTable.of(runs, evidence.references, normal, sigma, keys, evidence.jobs)
-    refit = NonlinearRefit(evidence, scores, sigma, null, pooled, table)
-    posterior, fits, failed = select_and_refit(refit, detection.p_value <= significance)
-    # answer: verdict, shrinkage, place, next run
-    refits = {law: found.fit for law, found in fits.items()} | failed
-    by_effect = {name: refits[law] for name, law in posterior.laws.items() if law in refits}
-    search = EffectSearch.of(refit, {**failed, **fits})
-    verdict = judge(detection, significance, pooled, posterior, by_effect, search)
+    robot = learn_offsets(normal, len(candidates.keys))
+    # infer: is there a gap, and which effects explain it
+    detection = detect(scores, robot, candidates, seed)
+    explanation = explain(evidence, sigma, robot, close=detection.p_value <= significance)
     if progress is not None:
         progress(0.9)
-    shrunk = shrinkage(evidence, scores, sigma, null, verdict.fit)
-    where = gap_map(evidence, sigma, null, seed)
+    # answer: verdict, shrinkage, place, next run
+    verdict = judge(detection, significance, explanation, candidates)
     drives = drive_coverage(runs, evidence.references, evidence.model)
-    if verdict.kind == "unknown" and drives is not None and drives.limits():
-        # Undecided: what no effect explains may come from drives that no reference made.
-        verdict = dataclasses.replace(verdict, kind="no_gap")
-    following = next_run(evidence, sigma, pooled, verdict)
-    notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
-    if verdict.fit is not None and verdict.fit.failure:
-        notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")
+    if drives is not None and drives.limits():
+        few = len(evidence.references) < MANY_REFERENCES
+        sure = not few or detection.p_value <= STRICTER * significance
+        verdict = verdict.where_drives_differ(sure)
+    shrunk = shrinkage(evidence, sigma, robot, verdict.fit)
+    where = gap_map(evidence, sigma, robot, seed)
+    following = Planner.of(evidence, sigma, robot, scores).next_run(verdict)
     return GapDiagnosis(
-        vehicle, detection, significance, uncalibrated, where, posterior, verdict, shrunk, following, drives,
-        by_effect, evidence, tuple(notes), time.perf_counter() - began,
+        vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,
+        drives, evidence, tuple(notes), time.perf_counter() - began,
     )  # fmt: skip
-
-
-def _score_with_discrepancy(evidence: GapEvidence, sigma: Array, run: WhitenedRun) -> Score:
-    discrepancy = discrepancy_of(run, evidence.model, sigma, len(evidence.candidates.keys))
-    return dataclasses.replace(score(run, sigma), discrepancy=discrepancy)
 
 
 def _with_replicates(evidence: GapEvidence, sigma: Array, normal: list[Score], seed: int) -> list[Score]:
     """References, and twin replicates around what they have in common."""
     templates = evidence.references or evidence.runs
-    offset = learn_null(normal, 1).offset if normal else None
+    offset = learn_offsets(normal, len(evidence.candidates.keys)).mean if normal else None
     return normal + replicates(templates, sigma, offset, REPLICATES, seed)
-
-
-def _too_few(references: int, runs: int, significance: float) -> str:
-    return (
-        f"{references} reference run(s) and {runs} run(s) are too few for a test at {significance:g}: twin "
-        "replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
-    )

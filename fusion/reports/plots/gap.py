@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.reports.plots import style
-from terrafusion.twin.gap.answer.credible_sets import credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES, regimes
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, CHANNEL_UNITS, commanded_twist
@@ -51,7 +50,7 @@ def plot_causes(d: GapDiagnosis) -> Figure:
     """Share of the gap that each of the first causes explains by itself; its probability beside it."""
     causes = [c for c in d.verdict.causes if c.share is not None][:MOST_CAUSES]
     fig, ax = style.canvas(None, (8.0, 1.0 + 0.32 * len(causes)))
-    alike = {name for s in credible_sets(d.verdict) if s.named for name in s.effects}
+    alike = {name for s in d.verdict.sets if s.named for name in s.effects}
     at = np.arange(len(causes))[::-1]
     shares = [100.0 * float(np.clip(c.share or 0.0, 0.0, 1.0)) for c in causes]
     colours = [

@@ -13,18 +13,13 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.gap.answer.effect_search import explained_held_out
-from terrafusion.twin.gap.answer.look_alikes import effect_signal, similarity
 from terrafusion.twin.gap.answer.verdict import null_probability
+from terrafusion.twin.gap.answer.where import permutations
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared, starting_model
 from terrafusion.twin.gap.data.samples import sample_map
-from terrafusion.twin.gap.infer.detect import permutations
-from terrafusion.twin.gap.infer.discrepancy import FUNCTIONS, discrepancy_of
-from terrafusion.twin.gap.infer.posterior import PooledScores, bayes_factors
 from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
-from terrafusion.twin.gap.null.null import learn_null
-from terrafusion.twin.gap.null.score import Score, score
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout import batch
 from terrafusion.twin.gap.rollout.batch import assign_graphs, effect_groups, motion_effects
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma, residuals_from, whitened
@@ -224,69 +219,6 @@ def test_null_probability_rises_with_the_p_value() -> None:
     assert null_probability(0.05) == pytest.approx(0.2893, abs=1e-3)  # Sellke et al. 2001, table 1
 
 
-def _scores(rng: np.random.Generator, count: int, shift: np.ndarray) -> list[Score]:
-    P = len(CANDIDATES.keys) + 6
-    J = np.random.default_rng(0).standard_normal((400, P))
-    errors = rng.standard_normal((count, 400)) + J @ shift
-    return [Score(J.T @ e, J.T @ J, float(e @ e), 400) for e in errors]
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_an_effect_of_one_side_is_not_believed_on_the_other(sign: float) -> None:
-    shift = np.zeros(len(CANDIDATES.keys) + 6)
-    column = CANDIDATES.keys.index("encoder_dropout/share")
-    rng = np.random.default_rng(3)
-    normal = _scores(rng, 20, shift)
-    shift[column] = sign
-    found = bayes_factors(PooledScores.of(_scores(rng, 3, shift), learn_null(normal, 3)), CANDIDATES)
-    first = max(found.effects, key=lambda k: found.effects[k])
-    assert (first == "encoder_dropout") == (sign > 0.0)
-
-
-def test_what_references_share_is_no_gap() -> None:
-    rng = np.random.default_rng(5)
-    wrong = 0.5 * rng.standard_normal(len(CANDIDATES.keys) + 6)
-    null = learn_null(_scores(rng, 20, wrong), 3)
-    alike, repaired = (
-        max(bayes_factors(PooledScores.of(_scores(rng, 3, k * wrong), null), CANDIDATES).effects.values())
-        for k in (1.0, 0.0)
-    )
-    assert alike < 0.01 * repaired
-
-
-def test_an_effect_is_wholly_like_itself() -> None:
-    null = learn_null(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
-    pooled = PooledScores.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
-    does, size = pooled.information[:, 3], float(pooled.information[3, 3])
-    assert similarity(pooled.information, does, size, [3, 4]) == pytest.approx(1.0)
-    assert similarity(pooled.information, does, size, [5]) < 0.5
-
-
-def test_what_a_silent_law_does_is_what_its_fit_takes_away() -> None:
-    """Its column says nothing; its fit takes away what another column does."""
-    silent, other, third = 3, 4, 5
-    null = learn_null(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
-    truth = np.zeros(len(CANDIDATES.keys) + 6)
-    truth[other] = 3.0
-    gap, after = (
-        PooledScores.of(_scores(np.random.default_rng(2), 3, t), null) for t in (truth, 0.0 * truth)
-    )
-    information = gap.information.copy()
-    information[silent], information[:, silent] = 0.0, 0.0
-    pooled = dataclasses.replace(gap, information=information)
-    does, size = effect_signal(pooled, [silent], lambda: after)
-    assert size == pytest.approx(gap.square - after.square)
-    assert (
-        similarity(pooled.information, does, size, [other])
-        > 0.8
-        > 2.0 * similarity(pooled.information, does, size, [third])
-    )
-    _, nothing = effect_signal(pooled, [silent], lambda: pooled)
-    assert nothing == pytest.approx(0.0, abs=1e-9)
-    _, by_signature = effect_signal(gap, [other], lambda: pooled)
-    assert by_signature > 100.0
-
-
 def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(catalogue, "_OWN", {})
     form = Form(
@@ -324,66 +256,20 @@ def test_the_geometry_that_logs_tell_is_said_and_has_to_be_one() -> None:
         starting_model([plain, told], vehicle, None)
 
 
-def test_factors_of_all_columns_are_those_of_each() -> None:
-    rng = np.random.default_rng(8)
-    shift = np.zeros(len(CANDIDATES.keys) + 6)
-    shift[4] = 0.3
-    pooled = PooledScores.of(_scores(rng, 3, shift), learn_null(_scores(rng, 20, 0.0 * shift), 3))
-    np.testing.assert_allclose(pooled.log_factors(), [pooled.log_factor([i]) for i in range(len(shift))])
-
-
-def test_scores_of_other_forms_are_those_of_the_whole_covariance(log_and_model) -> None:
+def test_scores_are_those_of_the_whole_covariance(log_and_model) -> None:
     log, model = log_and_model
     keys = ("gyro_scale/scale", "wheel_radius/scale")
     channels = tuple(o.channel for o in log.observed)
     seen = channel_sensitivities(log, linearise(log, model, CANDIDATES, log.start, keys))
     raw = residuals_from(log, seen, model, CANDIDATES, channels)
     run, sigma = whitened(raw, data_sheet_noise([raw])), initial_state_sigma(CANDIDATES)
-    T, K = run.states, len(CANDIDATES.keys)
+    T = run.states
     rows = run.rows.astype(float)
     covariance = np.eye(len(rows)) + (rows[:, :T] * sigma**2) @ rows[:, :T].T
     P = rows[:, T:-1]
     np.testing.assert_allclose(
         score(run, sigma).A, P.T @ np.linalg.solve(covariance, P), rtol=1e-3, atol=1e-2
     )
-    time = (run.time_s - run.time_s.mean()) / run.time_s.std()
-    at = CANDIDATES.keys.index(keys[1])
-    expected = P.T @ np.linalg.solve(covariance, P[:, at] * time)
-    found = discrepancy_of(run, model, sigma, K)[:, at, FUNCTIONS.index("time")]
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
-
-
-def test_a_law_of_another_form_is_believed_beside_its_effect() -> None:
-    """What the gap shows is an effect times an unknown function: with other forms it stands first."""
-    rng = np.random.default_rng(12)
-    zero = np.zeros(len(CANDIDATES.keys) + 6)
-    normal, plain = _scores(rng, 20, zero), _scores(rng, 3, zero)
-    column = CANDIDATES.keys.index("encoder_scale/reading")
-    hidden = np.random.default_rng(13).standard_normal(len(zero)) * 40.0
-    other = np.zeros((len(zero), len(CANDIDATES.keys), len(FUNCTIONS)))
-    other[:, column, 0] = hidden
-    gap = [dataclasses.replace(r, b=r.b + 0.2 * r.A[:, column] + 0.3 * hidden) for r in plain]
-    null = learn_null(normal, 3)
-    with_forms = [dataclasses.replace(r, discrepancy=other) for r in gap]
-    believed = [bayes_factors(PooledScores.of(runs, null), CANDIDATES) for runs in (gap, with_forms)]
-    assert believed[1].effects["encoder_scale"] > believed[0].effects["encoder_scale"] + 20.0
-    assert max(believed[1].effects, key=lambda k: believed[1].effects[k]) == "encoder_scale"
-
-
-def test_held_out_share_is_of_what_runs_have_in_common() -> None:
-    """An effect in all runs explains the run left out; one in a single run does not."""
-    rng = np.random.default_rng(21)
-    shift = np.zeros(len(CANDIDATES.keys) + 6)
-    null = learn_null(_scores(rng, 20, shift), 3)
-    still = _scores(rng, 2, shift)
-    shift[3] = 0.5
-    shared, single = _scores(rng, 3, shift), [*_scores(rng, 1, shift), *still]
-    pools = [[PooledScores.of([r], null) for r in runs] for runs in (shared, single)]
-    np.testing.assert_allclose(
-        PooledScores.sum(pools[0]).information, PooledScores.of(shared, null).information
-    )
-    assert explained_held_out(pools[0], [3]) > 0.8 * PooledScores.of(shared, null).fit([3])[2]
-    assert explained_held_out(pools[1], [3]) < 0.0
 
 
 def test_what_a_vehicle_is_built_like_is_no_cause() -> None:

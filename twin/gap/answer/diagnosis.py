@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from terrafusion.twin.gap.answer.credible_sets import credible_sets
 from terrafusion.twin.gap.answer.drives import DriveCoverage
 from terrafusion.twin.gap.answer.next_run import NextRun
 from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.answer.where import GapCell
-from terrafusion.twin.gap.infer.cause_posterior import CausePosterior
-from terrafusion.twin.gap.infer.detect import Detection
-from terrafusion.twin.gap.infer.refit import Refit
+from terrafusion.twin.gap.infer.explain import Explanation
+from terrafusion.twin.gap.infer.other_drives import Detection
 from terrafusion.twin.gap.null.evidence import GapEvidence
 
 SCHEMA = "terrafusion.gap/1"
@@ -26,16 +24,15 @@ class GapDiagnosis:
 
     Attributes:
         vehicle: its name.
-        detection: the permutation test.
+        detection: the test for a gap.
         significance: threshold of its p-value.
         uncalibrated: whether twin replicates stood in for references.
         where: cells of the gap map, most important first.
-        posterior: what each cause leaves of the gap, and its odds.
+        explanation: log evidence of sets of effects.
         verdict: causes and the judgement.
         shrinkage: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
         drives: how far references cover the judged drives; None without references.
-        refits: by effect, failures included.
         evidence: for plots.
         notes: assumptions, in sentences.
         elapsed_s: computing time.
@@ -46,12 +43,11 @@ class GapDiagnosis:
     significance: float
     uncalibrated: bool
     where: list[GapCell]
-    posterior: CausePosterior
+    explanation: Explanation
     verdict: GapVerdict
     shrinkage: Shrinkage
     next_run: NextRun | None
     drives: DriveCoverage | None
-    refits: dict[str, Refit]
     evidence: GapEvidence
     notes: tuple[str, ...]
     elapsed_s: float
@@ -101,7 +97,7 @@ class GapDiagnosis:
             "named": list(verdict.named),
             "sets": [
                 {"effects": list(s.effects), "probability": s.probability, "named": s.named}
-                for s in credible_sets(verdict)
+                for s in verdict.sets
             ],
             "drives": None
             if self.drives is None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -19,13 +20,12 @@ from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.effects.terrain import FORMS as GROUND_FORMS
-from terrafusion.twin.gap.answer.look_alikes import SEPARABLE_SIGMAS, unlike_square
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
-from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.infer.predictive import beyond_robot, beyond_scatter
 from terrafusion.twin.gap.null.evidence import GapEvidence
-from terrafusion.twin.gap.null.null import JITTER, Null
-from terrafusion.twin.gap.null.score import score
+from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
 from terrafusion.twin.model.soil import SoilParams, load_soil
@@ -35,6 +35,7 @@ from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 Array = NDArray[np.float64]
 
 BY_HAND = "measurement by hand"
+SEPARABLE_SIGMAS = 3.0  # sigmas by which a drive must distinguish two effects
 MOST_REPEATS = 10  # if the best drive would have to be repeated more often, none is suggested
 LIFTED = "wheels lifted"
 PAYLOAD = ", with payload"
@@ -81,91 +82,103 @@ class NextRun:
     why: str
 
 
-def next_run(
-    evidence: GapEvidence, sigma: Array, pooled: PooledScores, verdict: GapVerdict
-) -> NextRun | None:
-    """For the first named cause with look-alikes and the most probable of these; None without one.
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """Plans runs of a robot.
 
-    Args:
-        pooled: scores of the judged runs.
+    Attributes:
+        sigma: (T,) 1 sigma of the states.
+        known: (P, P) information of the judged runs on the columns, beyond what scatters from run to run.
     """
-    first = verdict.ambiguous() if verdict.kind == "ambiguous" else None
-    if first is None:
-        return None
-    other = next(c for c in verdict.causes if c.effect == first.members[1])
-    return propose(evidence, sigma, pooled, first, other)
 
+    evidence: GapEvidence
+    sigma: Array
+    robot: RobotOffsets
+    known: Array
 
-def propose(evidence: GapEvidence, sigma: Array, pooled: PooledScores, one: Cause, other: Cause) -> NextRun:
-    """The drive on which two causes differ most; a direct measurement where none separates them."""
-    effects = {one.effect, other.effect}
-    with ThreadPoolExecutor(evidence.jobs) as threads:
-        forecasts = threads.map(lambda name: forecast(evidence, sigma, name, effects), DRIVES)
-        found = dict(zip(DRIVES, forecasts, strict=True))
+    @classmethod
+    def of(cls, evidence: GapEvidence, sigma: Array, robot: RobotOffsets, scores: Sequence[Score]) -> Planner:
+        """After judged runs with these scores."""
+        return cls(evidence, sigma, robot, np.sum([beyond_scatter(s.A, robot) for s in scores], axis=0))
 
-    def sigmas(name: str, repeats: int = 1) -> float:
-        return separation(pooled, evidence, one, other, repeats * found[name])
+    def next_run(self, verdict: GapVerdict) -> NextRun | None:
+        """For the first named cause with look-alikes and the most probable of these; None without one."""
+        first = verdict.ambiguous() if verdict.kind == "ambiguous" else None
+        if first is None:
+            return None
+        other = next(c for c in verdict.causes if c.effect == first.members[1])
+        return self.propose(first, other)
 
-    best = max(found, key=sigmas)
-    pair = (one.effect, other.effect)
-    enough = (n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS)
-    repeats = next(enough, None)
-    if repeats is None:
+    def propose(self, one: Cause, other: Cause) -> NextRun:
+        """The drive on which two causes differ most; a direct measurement where none separates them."""
+        effects = {one.effect, other.effect}
+        with ThreadPoolExecutor(self.evidence.jobs) as threads:
+            found = dict(
+                zip(DRIVES, threads.map(lambda name: self.forecast(name, effects), DRIVES), strict=True)
+            )
+
+        def sigmas(name: str, repeats: int = 1) -> float:
+            return self.separation(one, other, repeats * found[name])
+
+        best = max(found, key=sigmas)
+        pair = (one.effect, other.effect)
+        enough = (n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS)
+        repeats = next(enough, None)
+        if repeats is None:
+            why = (
+                f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by "
+                f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
+            )
+            return NextRun(BY_HAND, pair, sigmas(best), why)
+        often = "once" if repeats == 1 else f"{repeats} times"
+        mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
+        load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
         why = (
-            f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by "
-            f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
+            f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
+            f"{sigmas(best):.1f} sigma with these runs at the size found; {often} should do{load}"
         )
-        return NextRun(BY_HAND, pair, sigmas(best), why)
-    often = "once" if repeats == 1 else f"{repeats} times"
-    mass = PAYLOAD_SHARE * evidence.model.vehicle.body.mass_kg
-    load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
-    why = (
-        f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
-        f"{sigmas(best):.1f} sigma with these runs at the size found; {often} should do{load}"
-    )
-    return NextRun(best, pair, sigmas(best), why)
+        return NextRun(best, pair, sigmas(best), why)
+
+    def separation(self, one: Cause, other: Cause, more: Array | float = 0.0) -> float:
+        """Sigmas by which runs separate two causes, whichever is true.
+
+        Args:
+            more: (P, P) information of further runs, from `forecast`.
+        """
+        every = beyond_robot(self.known + more, self.robot)
+        return min(
+            self._remaining_sigmas(every, one, other.effect), self._remaining_sigmas(every, other, one.effect)
+        )
+
+    def _remaining_sigmas(self, information: Array, true: Cause, other: str) -> float:
+        """Sigmas that remain of the true cause once any form of the other is fitted to it."""
+        at, c = np.asarray(true.columns), self.evidence.candidates
+        signal = information[:, at] @ true.value
+        square = float(true.value @ signal[at])
+        explained = max(_explained(information, signal, h.columns) for h in c.hypotheses if h.effect == other)
+        return math.sqrt(max(square - explained, 0.0))
+
+    def forecast(self, name: str, effects: set[str]) -> Array:
+        """Information (P, P) of a drive on some effects; zero where the twin diverges on it."""
+        P = len(self.known)
+        try:
+            own = score(_forecast(self.evidence, name, effects), self.sigma)
+        except TerrafusionError:
+            return np.zeros((P, P))
+        information = beyond_scatter(own.A, self.robot)
+        if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
+            keys = self.evidence.candidates.keys
+            ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]
+            information[ground, :] = information[:, ground] = 0.0
+        return information
 
 
-def separation(
-    pooled: PooledScores, evidence: GapEvidence, one: Cause, other: Cause, more: Array | float = 0.0
-) -> float:
-    """Sigmas by which runs separate two causes, whichever is true.
-
-    Args:
-        more: (P, P) information of further runs, from `forecast`.
-    """
-    plain = pooled.without_discrepancy()
-    every = dataclasses.replace(plain, information=plain.information + more)
-    return min(
-        _remaining_sigmas(every, evidence, one, other.effect),
-        _remaining_sigmas(every, evidence, other, one.effect),
-    )
-
-
-def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, other: str) -> float:
-    """Sigmas that remain of the true cause once any form of the other is fitted to it."""
-    at = np.asarray(true.columns)
-    signal = pooled.information[:, at] @ true.value
-    square = float(true.value @ signal[at])
-    return math.sqrt(
-        max(unlike_square(pooled.information, evidence.candidates, signal, square, other)[1], 0.0)
-    )
-
-
-def forecast(evidence: GapEvidence, sigma: Array, name: str, effects: set[str]) -> Array:
-    """Information (P, P) of a drive on some effects; zero where the twin diverges on it."""
-    P = evidence.runs[0].by_parameter.shape[1]
-    try:
-        own = score(_forecast(evidence, name, effects), sigma)
-    except TerrafusionError:
-        return np.zeros((P, P))
-    zero = np.zeros(P)
-    null = Null(zero, zero, own.fisher + JITTER * np.eye(P), 1)
-    information = PooledScores.of([dataclasses.replace(own, b=zero)], null).information
-    if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
-        ground = [i for i, key in enumerate(evidence.candidates.keys) if key.split("/")[0] in GROUND]
-        information[ground, :] = information[:, ground] = 0.0
-    return information
+def _explained(information: Array, signal: Array, columns: Sequence[int]) -> float:
+    """Square of a signal, given by its inner products (P,) with all columns, that some columns explain."""
+    b = np.asarray(columns)
+    within = information[np.ix_(b, b)]
+    within = within + 1e-9 * np.eye(len(b)) * max(float(np.trace(within)), 1e-12)
+    return float(signal[b] @ np.linalg.solve(within, signal[b]))
 
 
 def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRun:

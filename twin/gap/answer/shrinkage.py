@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.infer.posterior import PooledScores
-from terrafusion.twin.gap.infer.refit import Refit, RunWithEffects, effects_at, whitened_errors
+from terrafusion.twin.gap.answer.verdict import EffectFit
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
-from terrafusion.twin.gap.null.null import Null
-from terrafusion.twin.gap.null.score import Score
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
@@ -60,21 +59,19 @@ def without_states(run: WhitenedRun, sigma: Array, error: Array) -> Array:
     return error - J @ np.linalg.solve(run.state_information(sigma), J.T @ error)
 
 
-def own_error(run: WhitenedRun, null: Null) -> Array:
+def own_error(run: WhitenedRun, robot: RobotOffsets) -> Array:
     """The run's whitened error (n,) less what is common to the references."""
-    return run.error - run.by_parameter @ null.offset
+    return run.error - run.by_parameter @ robot.mean
 
 
-def shrinkage(
-    evidence: GapEvidence, scores: Sequence[Score], sigma: Array, null: Null, fit: Refit | None
-) -> Shrinkage:
-    """Shrinkage by a fitted effect; zero without one."""
+def shrinkage(evidence: GapEvidence, sigma: Array, robot: RobotOffsets, fit: EffectFit | None) -> Shrinkage:
+    """Shrinkage by fitted effects; zero without any."""
     runs, references = evidence.runs, evidence.references
-    was = [own_error(run, null) for run in runs]
-    now = _errors_left_out(evidence, scores, null, fit, was)
+    was = [own_error(run, robot) for run in runs]
+    now = _errors_left_out(evidence, robot, fit, was)
     free = [_mean_square(without_states(r, FREE * sigma, e)) for r, e in zip(runs, was, strict=True)]
     arms = [[without_states(r, sigma, e) for r, e in zip(runs, errors, strict=True)] for errors in (was, now)]
-    floors = [without_states(r, sigma, own_error(r, null)) for r in references]
+    floors = [without_states(r, sigma, own_error(r, robot)) for r in references]
     before, after = ([_mean_square(error) for error in arm] for arm in arms)
     squares = [_mean_square(error) for error in floors]
     floor = float(np.mean(squares)) if squares else None
@@ -116,21 +113,15 @@ def _rms(runs: Sequence[WhitenedRun], errors: Sequence[Array], channels: Sequenc
 
 
 def _errors_left_out(
-    evidence: GapEvidence, scores: Sequence[Score], null: Null, fit: Refit | None, was: list[Array]
+    evidence: GapEvidence, robot: RobotOffsets, fit: EffectFit | None, was: list[Array]
 ) -> list[Array]:
     """Errors of each run with the effect fitted to the other runs."""
     if fit is None:
         return was
-    whole, _, _ = PooledScores.of(scores, null).fit(fit.columns)
-    tried = []
-    for i in range(len(evidence.runs)):
-        others = [s for k, s in enumerate(scores) if k != i] or list(scores)
-        value, _, _ = PooledScores.of(others, null).fit(fit.columns)
-        value = fit.value + (value - whole)  # the linear change on top of the refit
-        soil = fit.soils[i] if fit.soils else None
-        tried.append(RunWithEffects(i, effects_at(evidence, fit.columns, value), soil))
+    values = enumerate(fit.left_out)
+    tried = [RunWithEffects(i, effects_at(evidence, fit.columns, value)) for i, value in values]
     errors = zip(evidence.runs, whitened_errors(evidence, tried), was, strict=True)
-    return [before if e is None else e - run.by_parameter @ null.offset for run, e, before in errors]
+    return [before if e is None else e - run.by_parameter @ robot.mean for run, e, before in errors]
 
 
 def _share(

@@ -1,4 +1,4 @@
-"""From the posterior, refits and shares to a verdict."""
+"""From the evidence of sets of effects to a verdict."""
 
 from __future__ import annotations
 
@@ -8,41 +8,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.twin.gap.answer.effect_search import (
-    EffectSearch,
-    EffectSet,
-    explained_share,
-    joint_log_odds,
-    null_explained,
-)
-from terrafusion.twin.gap.answer.look_alikes import (
-    effect_signal,
-    look_alikes,
-    same_signature,
-    signatures,
-)
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
-from terrafusion.twin.gap.infer.cause_posterior import OUTSIDE_SHARE, CausePosterior
-from terrafusion.twin.gap.infer.detect import Detection
-from terrafusion.twin.gap.infer.goodness_of_fit import GoodnessOfFit
-from terrafusion.twin.gap.infer.posterior import PooledScores
-from terrafusion.twin.gap.infer.refit import Refit
+from terrafusion.twin.gap.infer.calibration import Head, calibration_head, log_odds, probabilities
+from terrafusion.twin.gap.infer.explain import Explanation, Sets
+from terrafusion.twin.gap.infer.other_drives import Detection
+from terrafusion.twin.gap.infer.single_effects import Fitted
 from terrafusion.twin.gap.rollout.delay import DELAYS
 
-Array = NDArray[np.float64]
-
-SAME_ODDS, NEARLY_ALIKE = math.log(3.0), 0.9
-"""Effects whose log odds differ by less, and whose sensitivities correlate by more, cannot be distinguished,
-either (assumed)."""
-UNKNOWN = OUTSIDE_SHARE
-"""Probability of an unknown cause, given a gap, above which that is the verdict: more than its prior."""
-LAW_SIGMA_MOTION, LAW_SIGMA_SENSOR = 0.2, 0.03
-"""1 sigma, as a share of its value, by which the size of an effect on the motion or of a delay, which is read
-off the motion, and of another one of the sensors, is wrong because the robot's law is not the twin's. Set on
-development trials (docs/evidence/gap-blind.md)."""
-LEAST_PROBABILITY = 0.01  # of a cause whose look-alikes are sought
+UNKNOWN = 0.5  # probability of an unknown cause, given a gap, above which that is the verdict
+CREDIBLE, LEAST_MEMBER = 0.95, 0.02
+"""Probability of a credible set, and the least of a member, given the effects beside it."""
+MOST_UNNAMED, LEAST_PROBABILITY = 3, 0.01  # further sets, and the least probability of an effect in one
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +28,10 @@ class Cause:
     """One candidate.
 
     Attributes:
-        effect, members: its name, and those of its class (itself first, then its look-alikes).
-        probability: of it.
-        columns, value, sigma: (k,) its best columns, in units of `Candidates.scale`; sigma is NaN where the
-            fit failed.
-        share: of the gap that it explains; None where the fit failed.
+        effect, members: its name, and those of its credible set (itself first).
+        probability: of it; of effects that act together each has an equal part.
+        columns, value, sigma: (k,) its best law, in units of `Candidates.scale`.
+        share: of what all effects explain together.
     """
 
     effect: str
@@ -66,22 +43,49 @@ class Cause:
     share: float | None
 
 
+@dataclass(frozen=True)
+class CredibleSet:
+    """Effects of which one is present with a probability, and whether the verdict names it."""
+
+    effects: tuple[str, ...]
+    probability: float
+    named: bool
+
+
+@dataclass(frozen=True, eq=False)
+class EffectFit:
+    """The effects found: columns and values (k,), typical sizes, and the values fitted without each run."""
+
+    columns: tuple[int, ...]
+    value: Array
+    left_out: list[Array]
+
+
 @dataclass(frozen=True, eq=False)
 class GapVerdict:
-    """The verdict, its named effects, and all causes, the most probable first; `fit` and `goodness` are those
-    of the most probable effects, where there is a gap."""
+    """The verdict, its named effects, all causes and credible sets, the most probable first; `fit` is that of
+    the named effects, `log_odds` those of any effect against none."""
 
     kind: str
     named: tuple[str, ...]
     causes: list[Cause]
+    sets: list[CredibleSet]
     p_null: float
     p_unknown: float
-    fit: Refit | None
-    goodness: GoodnessOfFit | None = None
+    fit: EffectFit | None
+    log_odds: float = 0.0
 
     def ambiguous(self) -> Cause | None:
-        """The most probable of the named causes that has look-alikes."""
+        """The most probable of the named causes that cannot be distinguished from others."""
         return next((c for c in self.causes if c.effect in self.named and len(c.members) > 1), None)
+
+    def where_drives_differ(self, sure: bool = True) -> GapVerdict:
+        """On drives unlike the references': undecided where no effect explains the gap well, as it may come
+        from the drives, or where the test is not `sure`."""
+        if sure and self.kind != "unknown" and self.log_odds >= 0.0:
+            return self
+        loose = [dataclasses.replace(s, named=False) for s in self.sets]
+        return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)
 
 
 def null_probability(p_value: float) -> float:
@@ -93,101 +97,117 @@ def null_probability(p_value: float) -> float:
 
 
 def judge(
-    detection: Detection,
-    significance: float,
-    pooled: PooledScores,
-    posterior: CausePosterior,
-    refits: Mapping[str, Refit],
-    search: EffectSearch,
-) -> GapVerdict:
-    """The verdict.
-
-    Args:
-        pooled: scores of the judged runs.
-        posterior: the odds of all effects by themselves.
-        refits: by effect.
-        search: for several effects.
-    """
-    p_null = null_probability(detection.tail_probability(significance))
-    found: EffectSet | None = None
-    if detection.p_value <= significance:
-        found = search.best(posterior)
-        posterior = posterior.with_odds(joint_log_odds(found, posterior)).with_fit(found.goodness)
-    weight, unknown = posterior.probabilities()
-    p_unknown = (1.0 - p_null) * unknown if found is not None else 0.0
-    known = (1.0 - p_null - p_unknown) / sum(weight.values())
-    floor = null_explained(detection.references, pooled.own)
-    sizes = _CauseSizes(pooled, posterior, refits, search, floor, found)
-    causes = [sizes.cause(effect, weight[effect] * known) for effect in posterior.ranked()]
-    if found is None:
-        return GapVerdict("no_gap", (), causes, p_null, p_unknown, None)
+    detection: Detection, significance: float, found: Explanation, candidates: Candidates,
+    head: Head | None = None,
+) -> GapVerdict:  # fmt: skip
+    """The verdict; without a head, by that of the package."""
+    head = calibration_head() if head is None else head
+    p_null, detected = null_probability(detection.p_value), detection.p_value <= significance
+    sets, unknown = probabilities(found, len(candidates.effects), head, detection.p_value)
+    unknown = unknown if detected else 0.0
+    scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
+    sets = {name: scale * p for name, p in sets.items()}
+    best = _best(sets)
+    classes = {effect: _class(effect, best, sets, found.alike) for effect in (best if detected else ())}
+    credible = _credible(classes, sets) if detected else []
+    causes = _causes(found, sets, best, classes, candidates, head)
+    p_unknown = (1.0 - p_null) * unknown
+    if not detected:
+        return GapVerdict("no_gap", (), causes, [], p_null, p_unknown, None)
     if unknown > UNKNOWN:
-        return GapVerdict("unknown", (), causes, p_null, p_unknown, None, found.goodness)
-    kind = "parameters" if found.effects == (SOIL_STRENGTH,) else "effect"
-    verdict = GapVerdict(kind, found.effects, causes, p_null, p_unknown, found.fit, found.goodness)
-    if kind == "effect" and verdict.ambiguous() is not None:
-        return dataclasses.replace(verdict, kind="ambiguous")
-    return verdict
+        loose = [dataclasses.replace(s, named=False) for s in credible]
+        return GapVerdict("unknown", (), causes, loose, p_null, p_unknown, None)
+    named = tuple(c.effect for c in causes if c.effect in best)
+    kind = "ambiguous" if any(len(members) > 1 for members in classes.values()) else "effect"
+    kind = "parameters" if best == (SOIL_STRENGTH,) else kind
+    odds = log_odds(found, len(candidates.effects))
+    return GapVerdict(kind, named, causes, credible, p_null, p_unknown, _fit(found, found.fits[best]), odds)
 
 
-@dataclass(frozen=True, eq=False)
-class _CauseSizes:
-    """What the causes are made from; see `judge`."""
+def _best(sets: Mapping[Sets, float]) -> Sets:
+    """The most probable set of the most probable number of effects."""
+    by_count: dict[int, float] = {}
+    for name, p in sets.items():
+        by_count[len(name)] = by_count.get(len(name), 0.0) + p
+    count = max(by_count, key=lambda k: by_count[k])
+    return max((name for name in sets if len(name) == count), key=lambda name: sets[name])
 
-    pooled: PooledScores
-    posterior: CausePosterior
-    refits: Mapping[str, Refit]
-    search: EffectSearch
-    floor: tuple[float, float]
-    found: EffectSet | None
 
-    def cause(self, effect: str, probability: float) -> Cause:
-        pooled, candidates = self.pooled, self.search.refit.evidence.candidates
-        columns, fit, least = self.posterior.laws[effect].columns, self.refits.get(effect), 0.0
-        value, covariance, _ = pooled.fit(columns)
-        failed = fit is not None and bool(fit.failure)
-        if fit is not None and not failed:
-            columns, value, covariance, least = fit.columns, fit.value, fit.covariance, fit.explained
-        members: tuple[str, ...] = (effect,)
-        if probability >= LEAST_PROBABILITY:
-            members = self._members(effect, columns, value, refitted=fit is not None and not failed)
-        share = None
-        if not failed:
-            share = explained_share(pooled, candidates.columns(effect), self.floor, least)
-        joint = self.found.one(effect) if self.found is not None and effect in self._together() else None
-        if joint is not None:
-            columns, value, covariance = joint
-        sigma = np.full(len(columns), np.nan)
-        if joint is not None or not failed:
-            sigma = _size_sigma(pooled, candidates, columns, value, covariance)
-        return Cause(effect, members, max(probability, 0.0), columns, value, sigma, share)
+def _class(
+    effect: str, best: Sets, sets: Mapping[Sets, float], alike: Mapping[str, set[str]]
+) -> tuple[str, ...]:
+    """Effects that could stand in the place of one, the others being as they are; and those whose signatures
+    differ from its own by no more than a law is wrong."""
+    others = {*best} - {effect}
+    instead = {
+        next(iter({*name} - others)): p
+        for name, p in sets.items()
+        if (len(name) == len(best) and others < {*name}) or (not others and len(name) == 1)
+    }
+    total, sum_, members = sum(instead.values()), 0.0, [effect]
+    for name in sorted(instead, key=lambda name: (name != effect, -instead[name])):
+        if name != effect and (sum_ >= CREDIBLE * total or instead[name] < LEAST_MEMBER * total):
+            continue
+        members += [name] if name != effect else []
+        sum_ += instead[name]
+    same = alike.get(effect, set()) - {*members, *best}
+    return (*members, *sorted(same, key=lambda name: -instead.get(name, 0.0)))
 
-    def _together(self) -> tuple[str, ...]:
-        """Effects that were found together, several at least."""
-        return self.found.effects if self.found is not None and len(self.found.laws) > 1 else ()
 
-    def _members(self, effect: str, columns: Sequence[int], value: Array, refitted: bool) -> tuple[str, ...]:
-        """The effect and its look-alikes, without those found beside it."""
-        pooled, odds, order = self.pooled, self.posterior.odds, self.posterior.ranked()
-        candidates, law = self.search.refit.evidence.candidates, self.posterior.laws[effect]
-        signal, square = effect_signal(
-            pooled, columns, lambda: self.search.remaining([(law,)])[0][0] if refitted else pooled
+def _credible(classes: Mapping[str, tuple[str, ...]], sets: Mapping[Sets, float]) -> list[CredibleSet]:
+    """A set for each named effect, then for the most probable others; the most certain first."""
+
+    def present(effects: Sequence[str]) -> float:
+        return min(sum(p for name, p in sets.items() if {*effects} & {*name}), 1.0)
+
+    out = [CredibleSet(members, present(members), named=True) for members in classes.values()]
+    used = {effect for members in classes.values() for effect in members}
+    every = dict.fromkeys(effect for name in sets for effect in name if effect not in used)
+    rest = sorted(every, key=lambda effect: -present([effect]))[:MOST_UNNAMED]
+    out += [CredibleSet((e,), present([e]), named=False) for e in rest if present([e]) >= LEAST_PROBABILITY]
+    return sorted(out, key=lambda s: (not s.named, -s.probability))
+
+
+def _causes(
+    found: Explanation, sets: Mapping[Sets, float], best: Sets, classes: Mapping[str, tuple[str, ...]],
+    candidates: Candidates, head: Head,
+) -> list[Cause]:  # fmt: skip
+    """All candidates, the most probable first."""
+    weight = dict.fromkeys(candidates.effects, 0.0)
+    for name, p in sets.items():
+        for effect in name:
+            weight[effect] += p / len(name)
+    most = max(fit.gain for fit in found.fits.values())
+    out = []
+    for effect in sorted(weight, key=lambda effect: (-weight[effect], candidates.effects.index(effect))):
+        alone = found.fits[effect,]
+        law, value, covariance = _of(found.fits[best] if effect in best else alone, effect)
+        share = float(np.clip(alone.gain / max(most, 1e-9), 0.0, 1.0))
+        sigma = _sigma(candidates, law, value, covariance, head)
+        members = classes.get(effect) or next(
+            ((effect, *(m for m in some if m != effect)) for some in classes.values() if effect in some),
+            (effect,),
         )
-        others = [k for k in order if k != effect]
-        alike = look_alikes(pooled, candidates, signal, square, others)
-        close = [k for k in others if abs(odds[k] - odds[effect]) < SAME_ODDS]
-        close = list(look_alikes(pooled, candidates, signal, square, close, NEARLY_ALIKE))
-        whole = signatures(self.search.refit.evidence.runs, len(candidates.keys))
-        close += same_signature(whole, candidates, columns, value, others)
-        beside = self._together() if effect in self._together() else ()
-        return (effect, *(k for k in others if k not in beside and (k in alike or k in close)))
+        out.append(Cause(effect, members, weight[effect], law, value, sigma, share))
+    return out
 
 
-def _size_sigma(
-    pooled: PooledScores, candidates: Candidates, columns: Sequence[int], value: Array, covariance: Array
+def _of(fit: Fitted, effect: str) -> tuple[tuple[int, ...], Array, Array]:
+    """Columns, values and covariance of one effect in a fit."""
+    i = next(i for i, law in enumerate(fit.laws) if law.effect == effect)
+    return fit.laws[i].columns, fit.values[i], fit.covariance[i]
+
+
+def _sigma(
+    candidates: Candidates, columns: Sequence[int], value: Array, covariance: Array, head: Head
 ) -> Array:
-    """1 sigma (k,) of sizes: of noise, at least as the references scatter, and of the law."""
-    noise = np.maximum(np.sqrt(np.diag(covariance)), pooled.marginal.sigmas(columns))
+    """1 sigma (k,) of sizes: by the runs, and by how wrong the law is."""
     motion = {*candidates.moving, *DELAYS}
-    law = [LAW_SIGMA_MOTION if candidates.keys[i] in motion else LAW_SIGMA_SENSOR for i in columns]
-    return np.asarray(np.hypot(noise, law * np.abs(value)))
+    law = [head.law_motion if candidates.keys[i] in motion else head.law_sensor for i in columns]
+    return np.hypot(np.sqrt(np.diag(covariance)), law * np.abs(value))
+
+
+def _fit(found: Explanation, fit: Fitted) -> EffectFit:
+    columns = tuple(i for law in fit.laws for i in law.columns)
+    left_out = [np.concatenate(values) for values in found.left_out(fit)]
+    return EffectFit(columns, np.concatenate(fit.values), left_out)

@@ -7,6 +7,8 @@ greatest standardised excess over all cells, of other choices of runs (max-T, We
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +16,8 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.answer.shrinkage import own_error, without_states
-from terrafusion.twin.gap.infer.detect import permutations
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
-from terrafusion.twin.gap.null.null import Null
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
@@ -36,6 +37,7 @@ BANDS = ("below 0.5 Hz", "above 0.5 Hz")
 SLOW_S = 2.0  # means over this interval are the slow band
 ACCELERATION_SAMPLES = 51  # grid samples over which the acceleration is averaged: half a second
 LEAST_SAMPLES = 5
+PERMUTATIONS = 99  # most other choices of runs that the judged ones are compared with
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
 
 
@@ -97,12 +99,12 @@ def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int,
     return out
 
 
-def gap_map(evidence: GapEvidence, sigma: Array, null: Null, seed: int) -> list[GapCell]:
+def gap_map(evidence: GapEvidence, sigma: Array, robot: RobotOffsets, seed: int) -> list[GapCell]:
     """All cells with enough samples, most important first; none with fewer than `LEAST_REFERENCES`."""
     runs, count_runs = [*evidence.runs, *evidence.references], len(evidence.runs)
     if len(evidence.references) < LEAST_REFERENCES:
         return []
-    errors = [without_states(run, sigma, own_error(run, null)) for run in runs]
+    errors = [without_states(run, sigma, own_error(run, robot)) for run in runs]
     table = [cells(run, evidence.model, e) for run, e in zip(runs, errors, strict=True)]
     keys = [
         k for k in table[0] if all(k in t for t in table) and min(t[k][1] for t in table[:count_runs]) >= 1.0
@@ -138,6 +140,19 @@ def gap_map(evidence: GapEvidence, sigma: Array, null: Null, seed: int) -> list[
         for i, (channel, regime, band) in enumerate(keys)
     ]  # fmt: skip
     return sorted(found, key=lambda c: (c.p_value > 0.05, -c.share, c.channel, c.regime, c.band))
+
+
+def permutations(total: int, size: int, seed: int) -> list[tuple[int, ...]]:
+    """Choices of `size` out of `total` runs other than the first ones, at most `PERMUTATIONS`."""
+    own = tuple(range(size))
+    if math.comb(total, size) <= PERMUTATIONS + 1:
+        return [c for c in itertools.combinations(range(total), size) if c != own]
+    rng, found = np.random.default_rng(seed), dict[tuple[int, ...], None]()
+    while len(found) < PERMUTATIONS:
+        some = tuple(sorted(int(i) for i in rng.choice(total, size, replace=False)))
+        if some != own:
+            found[some] = None
+    return list(found)
 
 
 def _excess(square: Array, count: Array, chosen: NDArray[np.int64]) -> Array:

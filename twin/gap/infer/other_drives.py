@@ -1,8 +1,8 @@
-"""Is a judged drive unusual for the robot that the references show: a p-value that holds on other drives.
+"""Is there a gap: whether the judged drives are unusual for the robot that the references show.
 
 Ranks among runs are exact while all runs make the same kind of drive; a drive that no reference made is
 always the odd one out. Here the columns of a run are random effects, phi_run ~ N(phi_robot, Omega) and
-phi_robot ~ N(0, 1), in typical sizes, learned from the references by expectation-maximisation (Laird and Ware
+phi_robot ~ N(0, T), in typical sizes, learned from the references by expectation-maximisation (Laird and Ware
 1982). For the judged drive with the information A that gives scores b ~ N(A m, A (V + Omega) A + A): what the
 references know of a column travels to any drive, and what they do not know counts as unknown. Replicates of
 the judged drive have the same distribution, and the p-value is the rank among them.
@@ -10,6 +10,7 @@ the judged drive have the same distribution, and the p-value is the rank among t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -17,14 +18,20 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.posterior import UNKNOWN_SIZES, WIDE
-from terrafusion.twin.gap.null.null import JITTER
 from terrafusion.twin.gap.null.score import Score
+from terrafusion.twin.gap.rollout.nuisance import BASIS
 
 CANDIDATE_SCATTER, NUISANCE_SCATTER, PRIOR_RUNS = 0.15, 0.05, 4.0
 """Prior 1 sigma from run to run of an effect and of a column of the nuisance basis, in their units, and its
 weight in runs (set on the twin's own runs on other drives than the study's)."""
+PRIOR_COLUMNS = 8.0
+"""Weight, in columns, of an offset's prior variance of one, the least. A larger one is learned, for the
+effects together and for the columns of each channel: where the twin is wrong on the references' drives, it
+may be as wrong on others."""
 EM_STEPS = 8
+JITTER = 0.02  # variance added to a standardised score: no combination of scores is taken as exact
+WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)  # 1 sigma of an effect's size, and of an unknown cause's
+TAIL_FREEDOM = 10  # degrees of freedom of the tail of the statistic: heavier than normal (assumed)
 FEWEST = 3  # references from which a scatter can be learned
 REPLICATES = 1000
 LEAST_SQUARE = 1.5  # least typical square of a deviation
@@ -50,26 +57,43 @@ def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
     """From at least `FEWEST` references; the first `candidates` columns are those of effects."""
     P, count = len(references[0].b), len(references)
     first = np.where(np.arange(P) < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER) ** 2
-    scatter = first
+    group = np.maximum(np.arange(P) - candidates, -1) // len(BASIS)
+    scatter, offset = first, np.ones(P)
     for _ in range(EM_STEPS):
         within = [np.linalg.inv(r.A + np.diag(1.0 / scatter)) for r in references]
         moved = [H @ r.A for r, H in zip(references, within, strict=True)]
         known = [r.A - r.A @ m for r, m in zip(references, moved, strict=True)]
         gain = [r.b - r.A @ (H @ r.b) for r, H in zip(references, within, strict=True)]
-        covariance: Array = np.asarray(np.linalg.inv(np.eye(P) + sum(known)))
+        covariance: Array = np.asarray(np.linalg.inv(np.diag(1.0 / offset) + sum(known)))
         mean = covariance @ np.sum(gain, axis=0)
         square = np.zeros(P)
         for r, H, m in zip(references, within, moved, strict=True):
             own = H @ (r.b - r.A @ mean)
             square += own**2 + np.diag(H) + np.einsum("ij,ij->i", m @ covariance, m)
         scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + count)
+        own = mean**2 + np.diag(covariance)
+        for k in np.unique(group):
+            mine = group == k
+            offset[mine] = max((PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + mine.sum()), 1.0)
     return RobotOffsets(mean, covariance, scatter, count)
 
 
-def p_value_of_drive(
-    runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int
-) -> float:
-    """Share of replicates of the judged runs, taken together, that deviate as much from the robot."""
+@dataclass(frozen=True)
+class Detection:
+    """Result of the test: the greatest deviation of any effect, in units of its typical value in replicates,
+    and its p-value."""
+
+    statistic: float
+    p_value: float
+
+
+def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int) -> Detection:
+    """How unusual the judged runs are, taken together, among replicates of them.
+
+    Beyond all replicates the p-value is extrapolated: the logarithm of the statistic as Student's t.
+    """
+    from scipy.special import stdtr
+
     A = np.sum([r.A for r in runs], axis=0)
     spread = A @ offsets.covariance @ A + A + sum((r.A * offsets.scatter) @ r.A for r in runs)
     squares = _deviations(A, spread, candidates)
@@ -77,7 +101,12 @@ def p_value_of_drive(
     typical = np.maximum(others.mean(axis=0), LEAST_SQUARE)
     greatest = (others / typical).max(axis=1)
     found = (squares((np.sum([r.b for r in runs], axis=0) - A @ offsets.mean)[None]) / typical).max()
-    return float((1 + np.count_nonzero(greatest >= found)) / (1 + len(greatest)))
+    p_value = float((1 + np.count_nonzero(greatest >= found)) / (1 + len(greatest)))
+    if found > greatest.max():
+        others = np.log(greatest)
+        z = (math.log(found) - others.mean()) / others.std()
+        p_value = min(p_value, float(stdtr(TAIL_FREEDOM, -z)))
+    return Detection(math.sqrt(float(found)), p_value)
 
 
 def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.random.Generator) -> Array:

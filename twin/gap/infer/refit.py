@@ -1,4 +1,4 @@
-"""Effects fitted to the judged runs by simulating the twin with them, instead of its linearisation."""
+"""Errors of the judged runs against the twin with effects in it, by simulating it."""
 
 from __future__ import annotations
 
@@ -15,30 +15,6 @@ from terrafusion.twin.gap.rollout.run_soil import referred_to_model, with_run_so
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Refit:
-    """One or several effects fitted to the judged runs.
-
-    Attributes:
-        columns: indices of the parameters.
-        value, covariance: (k,) and (k, k) in typical sizes.
-        explained: by how much it reduces the gap's square.
-        errors: whitened errors of each run at the value; none where the fit failed.
-        soils: (S,) of each run beside it, typical sizes from the model's.
-        squares: (P,) of the deviations that remain (`MarginalScores.squares`); none where the fit failed.
-        failure: what went wrong; "" where nothing did.
-    """
-
-    columns: tuple[int, ...]
-    value: Array
-    covariance: Array
-    explained: float
-    errors: list[Array]
-    soils: tuple[Array, ...]
-    squares: Array
-    failure: str
 
 
 def effects_at(evidence: GapEvidence, columns: Sequence[int], value: Array) -> dict[str, float]:
@@ -61,7 +37,9 @@ class RunWithEffects:
     soil: Array | None = None
 
 
-def whitened_errors(evidence: GapEvidence, tried: Sequence[RunWithEffects]) -> list[Array | None]:
+def whitened_errors(
+    evidence: GapEvidence, tried: Sequence[RunWithEffects], clip: bool = True
+) -> list[Array | None]:
     """Whitened errors of the judged runs against the twin with these effects; None where it diverges."""
     soils = [evidence.residuals[t.run].soil if t.soil is None else t.soil for t in tried]
     applied = [with_run_soil(s, evidence.cache, t.effects) for t, s in zip(tried, soils, strict=True)]
@@ -77,7 +55,7 @@ def whitened_errors(evidence: GapEvidence, tried: Sequence[RunWithEffects]) -> l
         run, residuals = evidence.runs[k], evidence.residuals[k]
         error = [o.value - value for o, value in zip(run.log.observed, y, strict=True)]
         error = referred_to_model(residuals, applied[i][1], error)
-        return whitened_error(residuals, run, evidence.noise, error)
+        return whitened_error(residuals, run, evidence.noise, error, clip)
 
     with ThreadPoolExecutor(evidence.jobs) as threads:
         return list(threads.map(whitened, range(len(tried))))

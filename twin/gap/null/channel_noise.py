@@ -14,6 +14,7 @@ from terrafusion.twin.gap.data.samples import Indices, sample_map
 from terrafusion.twin.gap.rollout.residuals import (
     RunResiduals,
     initial_state_sigma,
+    noise_sigma,
     projected,
     whitened_columns,
 )
@@ -125,12 +126,13 @@ def _fit_residuals(
     K = len(prior)
     fit = np.linalg.solve(evidence.gram[:K, :K] + np.diag(prior), evidence.gram[:K, -1])
     pose = _best_poses(evidence.window, white[:, -3:], white[:, K] - white[:, :K] @ fit)
+    sigma_of = [noise_sigma(o, noise[o.channel]) for o in run.log.observed]
     out: dict[str, Series] = {}
     for i, k, rows in sample_map(run.log).blocks:
         observed = run.log.observed[i]
         rest = run.error[i][rows] - run.by_state[i][rows] @ fit[: len(sigma)]
         rest -= run.by_effect[i][rows] @ fit[len(sigma) :] + run.by_pose[i][rows] @ pose[k]
-        out.setdefault(observed.channel, []).append((observed.slot[rows], rest / observed.sigma[rows]))
+        out.setdefault(observed.channel, []).append((observed.slot[rows], rest / sigma_of[i][rows]))
     return out
 
 

@@ -6,7 +6,6 @@ C(alpha) tests; here theta is random with variance Sigma, so it is projected out
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,26 +24,12 @@ REPLICATES = 20  # twin replicates that stand in for references
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score b (P,) and information A (P, P) of one run, and the sum of squares that theta leaves.
-
-    `discrepancy` (P, K, F): change of the score by the model discrepancy (see there); None where not needed.
-    """
+    """Score b (P,) and information A (P, P) of one run, and the sum of squares that theta leaves."""
 
     b: Array
     A: Array
     square: float
     samples: int
-    discrepancy: Array | None = None
-
-    @functools.cached_property
-    def root(self) -> Array:
-        """(P,) factors that scale b to unit variance, or to zero where there is no information."""
-        return np.asarray(1.0 / np.sqrt(np.diag(self.A) + 1.0))
-
-    @functools.cached_property
-    def fisher(self) -> Array:
-        """(P, P) covariance of `root` times b, were the twin right."""
-        return self.root[:, None] * self.A * self.root
 
 
 def score(run: WhitenedRun, sigma: Array) -> Score:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
@@ -16,9 +17,10 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
+from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.data.samples import Indices, sample_map
@@ -188,7 +190,7 @@ def residuals_from(
     channels: Sequence[str],
 ) -> RunResiduals:
     """Errors and derivatives of a run, from its sensitivities."""
-    soil = soil_columns(candidates)
+    soil, log = soil_columns(candidates), with_timing(log, [s.value for s in found])
     error, by_state, by_nuisance = [], [], []
     for observed, s in zip(log.observed, found, strict=True):
         error.append(observed.value - s.value)
@@ -222,14 +224,49 @@ def initial_state_sigma(candidates: Candidates) -> Array:
     return np.array([*soil, *np.ones(len(OFFSET_SIGMAS) + 2 * len(CURRENTS))])
 
 
+def with_timing(log: PreparedLog, predicted: Sequence[Array]) -> PreparedLog:
+    """The log with `Observed.timing`: a command changed at some time since the one before, which moves every
+    channel by its rate of change, here that of the prediction."""
+    if log.input_step_s == 0.0:
+        return log
+    late_s = log.input_step_s / math.sqrt(3.0)  # of a uniform distribution
+    pairs = zip(log.observed, predicted, strict=True)
+    out = [dataclasses.replace(o, timing=_timing_sigma(o, log, y, late_s)) for o, y in pairs]
+    return dataclasses.replace(log, observed=tuple(out))
+
+
+def _timing_sigma(observed: Observed, log: PreparedLog, predicted: Array, late_s: float) -> Array:
+    """1 sigma (n,) of a channel whose input is late by so much, of 1 sigma: its slope times that; and a jump
+    of a current, which is sampled, not averaged, falls on the other side of a sample as often as that over
+    its slot."""
+    apart = np.maximum(np.diff(observed.slot), 1) * observed.slot_s
+    slope = np.diff(predicted) / apart
+    slope[np.diff(window_of(observed, log.windows)) != 0] = 0.0  # the pose is reset
+    before, after = np.append(0.0, slope), np.append(slope, 0.0)
+    rate = np.maximum(np.abs(before), np.abs(after))
+    if observed.channel not in CURRENTS:
+        return np.asarray(late_s * rate)
+    bend = np.abs(after - before) * observed.slot_s
+    jump = np.maximum(bend, np.maximum(np.append(0.0, bend[:-1]), np.append(bend[1:], 0.0)))
+    return np.hypot(late_s * rate, jump * math.sqrt(min(late_s / observed.slot_s, 1.0)))
+
+
+def noise_sigma(observed: Observed, noise: ResidualNoise) -> Array:
+    """1 sigma (n,) of a channel's samples, in units of the noise's scale."""
+    if observed.timing is None:
+        return observed.sigma
+    return np.hypot(observed.sigma, observed.timing / noise.scale)
+
+
 def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, given one array a channel, in units and axes in which the noise is
     white."""
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
+    sigma = [noise_sigma(o, noise[o.channel]) for o in log.observed]
     for i, rows, places in sample_map(log).equally_spaced:
         observed = log.observed[i]
         out[places] = noise[observed.channel].whiten_alike(
-            observed.slot[rows[0]], observed.sigma[rows], columns[i][rows]
+            observed.slot[rows[0]], sigma[i][rows], columns[i][rows]
         )
     return out
 
@@ -237,10 +274,11 @@ def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], colum
 def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Array) -> Array:
     """A whitened error (n,) in the units of the channels."""
     out = np.empty(len(error))
+    sigma = [noise_sigma(o, noise[o.channel]) for o in run.log.observed]
     for i, rows, places in sample_map(run.log).equally_spaced:
         observed = run.log.observed[i]
         out[places] = noise[observed.channel].unwhiten_alike(
-            observed.slot[rows[0]], observed.sigma[rows], error[places]
+            observed.slot[rows[0]], sigma[i][rows], error[places]
         )
     return out
 
@@ -279,11 +317,15 @@ def _orthonormal(columns: Array) -> Array:
 
 
 def whitened_error(
-    run: RunResiduals, white: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Sequence[Array]
+    run: RunResiduals,
+    white: WhitenedRun,
+    noise: Mapping[str, ResidualNoise],
+    error: Sequence[Array],
+    clip: bool = True,
 ) -> Array:
     """Another error of the run, one array a channel, whitened (n,), poses projected out, outliers clipped."""
-    out = whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0]
-    return clip_outliers(white, white.without_poses(out))
+    out = white.without_poses(whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0])
+    return clip_outliers(white, out) if clip else out
 
 
 def explained_by_states(J: Array, gain: Array, error: Array, limit: float, steps: int) -> Array:

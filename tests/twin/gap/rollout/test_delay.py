@@ -10,17 +10,10 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared, starting_model
 from terrafusion.twin.gap.data.samples import sample_map
-from terrafusion.twin.gap.infer.channels import ChannelTable
-from terrafusion.twin.gap.infer.nonlinear_refit import NonlinearRefit
-from terrafusion.twin.gap.infer.posterior import PooledScores
-from terrafusion.twin.gap.null.evidence import gather_evidence
-from terrafusion.twin.gap.null.null import learn_null
-from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.delay import CLOCK_DRIFT, DELAYS, IMU, delayed_samples, without_delays
-from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, predictions
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.runs import run, runs
+from tests.twin.gap.runs import run
 
 CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
 
@@ -89,23 +82,3 @@ def test_an_offset_that_grows_is_that_of_its_row(log_and_model) -> None:
     assert time_of(grown, row) == pytest.approx(time_of(constant, row), abs=0.6)  # samples of 10 ms
     assert delayed_samples(log, {"gyro_bias/constant": 0.1}) == sample_map(log).fine
     assert without_delays({CLOCK_DRIFT: 0.6, "gyro_bias/constant": 0.1}) == {"gyro_bias/constant": 0.1}
-
-
-def test_a_delay_beyond_its_signature_is_found() -> None:
-    """An IMU .3 s late, fifteen typical sizes, on a drive whose turns change every two to three seconds."""
-    candidates, key, truth = Candidates.of(["imu_time_offset"]), "imu_time_offset/shift", 0.3
-    law = next(h for h in candidates.hypotheses if h.form == "shift")
-    evidence = gather_evidence(
-        runs(980, 1, {key: truth}), runs(985, 3), load_vehicle("elevate"), None, candidates, jobs=1
-    )
-    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
-    normal, scores = ([score(r, sigma) for r in some] for some in (evidence.references, evidence.runs))
-    null = learn_null(normal, 1)
-    pooled = PooledScores.of(scores, null)
-    table = ChannelTable.of(evidence.runs, evidence.references, normal, sigma, len(candidates.keys))
-    value, _ = table.linear_fit(law.columns, *candidates.bounds(law.columns))
-    best = NonlinearRefit(evidence, scores, sigma, null, pooled, table).fits([(law, value)])[0][law]
-    scale = float(candidates.scale[candidates.keys.index(key)])
-    assert abs(float(value[0]) * scale - truth) > 0.1  # the signature misleads
-    assert float(best.fit.value[0]) * scale == pytest.approx(truth, abs=0.015)
-    assert best.left.total < 0.25 * table.before().total

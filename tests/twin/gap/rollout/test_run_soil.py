@@ -1,4 +1,4 @@
-"""Fits through the twin on each run's own ground: what a state explained first, a law may take over."""
+"""Each run on its own ground."""
 
 from __future__ import annotations
 
@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.cause_posterior import linear_residuals
-from terrafusion.twin.gap.infer.channels import ChannelTable
-from terrafusion.twin.gap.infer.nonlinear_refit import NonlinearRefit, line_search_size
-from terrafusion.twin.gap.infer.posterior import PooledScores
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.null.null import learn_null
-from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, clip_outliers, initial_state_sigma
 from terrafusion.twin.gap.rollout.run_soil import soil_limit
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -29,27 +23,6 @@ def evidence() -> GapEvidence:
     candidates = Candidates.of(["soil_strength", "motion_resistance", "wheel_radius"])
     given = runs(980, 2, STRONGER), runs(985, 4)
     return gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
-
-
-def refit_of(evidence: GapEvidence) -> NonlinearRefit:
-    """What fits laws to the evidence's runs."""
-    sigma = learn_state_sigma(evidence.references, initial_state_sigma(evidence.candidates))
-    normal, scores = ([score(r, sigma) for r in some] for some in (evidence.references, evidence.runs))
-    null = learn_null(normal, len(scores))
-    table = ChannelTable.of(evidence.runs, evidence.references, normal, sigma, len(evidence.candidates.keys))
-    return NonlinearRefit(evidence, scores, sigma, null, PooledScores.of(scores, null), table)
-
-
-def test_a_ground_far_away_is_driven_and_not_a_multiple_of_a_small_change(evidence: GapEvidence) -> None:
-    """Fitted through the twin little is left; no multiple of the derivative at the references' does that."""
-    refit = refit_of(evidence)
-    residuals, sizes = linear_residuals(refit.table, refit.pooled, evidence.candidates)
-    law = next(h for h in evidence.candidates.hypotheses if (h.effect, h.form) == ("soil_strength", "shear"))
-    found = refit.fits([(law, sizes[law])])[0][law]
-    scale = evidence.candidates.scale[law.columns[0]]
-    assert float(found.fit.value[0]) * scale == pytest.approx(STRONGER["soil_strength/shear"], abs=0.1)
-    assert found.left.total < 0.35 * residuals[law].total
-    assert all((np.abs(own) <= evidence.soil_limit).all() for own in found.fit.soils)
 
 
 def test_a_run_looks_for_its_ground_where_the_references_are(evidence: GapEvidence) -> None:
@@ -90,18 +63,3 @@ def test_limits_move_with_what_the_states_explain(evidence: GapEvidence) -> None
     spike = np.zeros(len(J))
     spike[len(J) // 2] = 100.0
     assert 3.9 < clip_outliers(tight, spike).max() < 8.0
-
-
-def test_the_next_size_lies_between_the_best_ones_and_beyond_the_last() -> None:
-    def tried(*pairs: tuple[float, float]) -> list[tuple[np.ndarray, float]]:
-        return [(np.array([size]), left) for size, left in pairs]
-
-    whole = [(x, (x - 0.7) ** 2) for x in (0.3, 0.6, 1.2)]
-    assert line_search_size(tried(*whole), before=0.49) == pytest.approx(
-        0.7, abs=0.05
-    )  # a parabola's own least
-    assert line_search_size(tried((1.0, 3.0), (2.0, 1.0)), before=4.0) == pytest.approx(3.0)
-    assert line_search_size(tried((-1.0, 3.0), (-2.0, 1.0)), before=4.0) == pytest.approx(-3.0)
-    assert line_search_size(tried((1.0, 9.0), (2.0, 9.5)), before=8.0) == pytest.approx(
-        -1.0
-    )  # none helps: below zero

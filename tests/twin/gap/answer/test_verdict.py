@@ -1,0 +1,94 @@
+"""Verdicts from the evidence of sets of effects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.answer.verdict import GapVerdict, judge
+from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.infer.calibration import Head
+from terrafusion.twin.gap.infer.explain import Explanation
+from terrafusion.twin.gap.infer.other_drives import Detection
+from terrafusion.twin.gap.infer.single_effects import Fitted
+
+NAMES = ("soil_strength", "mass", "gyro_bias", "gyro_scale", "track_width")
+CANDIDATES = Candidates.of(NAMES)
+HEAD = Head(1.0, -4.0, 0.1, 0.03)
+FOUND = Detection(9.0, 1e-6)
+
+
+def fitted(*effects: str) -> Fitted:
+    laws = tuple(next(h for h in CANDIDATES.hypotheses if h.effect == e) for e in effects)
+    columns: tuple[Hypothesis, ...] = laws
+    values = tuple(np.full(len(h.columns), 2.0) for h in columns)
+    return Fitted(laws, values, np.zeros(1), 10.0, 10.0, tuple(0.01 * np.eye(len(v)) for v in values))
+
+
+def verdict(
+    evidence: dict[tuple[str, ...], float], outside: float = -50.0,
+    detection: Detection = FOUND, alike: dict[str, set[str]] | None = None,
+) -> GapVerdict:  # fmt: skip
+    every = {(name,): -50.0 for name in NAMES} | evidence
+    fits = {effects: fitted(*effects) for effects in every}
+    found = Explanation(every, fits, outside, alike or {}, lambda fit: [fit.values] * 3)
+    return judge(detection, 0.05, found, CANDIDATES, HEAD)
+
+
+def test_two_certain_effects_are_each_certain() -> None:
+    both = verdict({("gyro_bias", "mass"): 80.0, ("mass",): 40.0, ("gyro_bias",): 30.0})
+    assert both.kind == "effect"
+    assert {*both.named} == {"gyro_bias", "mass"}
+    named = [s for s in both.sets if s.named]
+    assert [s.effects for s in named] in ([("gyro_bias",), ("mass",)], [("mass",), ("gyro_bias",)])
+    assert all(s.probability > 0.95 for s in named)
+    total = sum(c.probability for c in both.causes) + both.p_null + both.p_unknown
+    assert total == pytest.approx(1.0)
+    assert both.fit is not None
+    assert len(both.fit.left_out) == 3
+
+
+def test_effects_that_are_as_likely_share_a_set_of_their_sum() -> None:
+    alike = verdict({("mass",): 60.0, ("track_width",): 59.5, ("gyro_bias",): 50.0})
+    assert alike.kind == "ambiguous"
+    assert alike.named == ("mass",)
+    assert set(alike.sets[0].effects) == {"mass", "track_width"}
+    assert alike.sets[0].probability > 0.95 > alike.causes[0].probability
+    assert alike.causes[0].members == ("mass", "track_width")
+    assert alike.causes[1].members == ("track_width", "mass")
+
+
+def test_a_look_alike_of_one_of_two_is_in_its_set_alone() -> None:
+    pairs = {("gyro_bias", "mass"): 80.0, ("gyro_bias", "track_width"): 79.5, ("mass",): 40.0}
+    found = {frozenset(s.effects) for s in verdict(pairs).sets if s.named}
+    assert found == {frozenset({"mass", "track_width"}), frozenset({"gyro_bias"})}
+
+
+def test_effects_of_the_same_signature_are_one_set_whatever_the_evidence() -> None:
+    found = verdict({("mass",): 60.0, ("track_width",): 30.0}, alike={"mass": {"track_width"}})
+    assert found.kind == "ambiguous"
+    assert found.sets[0].effects == ("mass", "track_width")
+
+
+def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
+    sure = Detection(9.0, 1e-12)
+    weak = verdict({("mass",): 5.0}, detection=sure)
+    assert weak.kind == "unknown"
+    assert weak.named == ()
+    assert weak.p_unknown > 0.5
+    assert verdict({("mass",): 60.0}, detection=sure).kind == "effect"
+    assert verdict({("mass",): 10.0}, outside=60.0).kind == "unknown"
+    none = verdict({("mass",): 60.0}, detection=Detection(1.0, 0.6))
+    assert none.kind == "no_gap"
+    assert none.p_unknown == 0.0
+    assert none.sets == []
+
+
+def test_a_stronger_ground_is_a_parameter() -> None:
+    assert verdict({("soil_strength",): 60.0}).kind == "parameters"
+
+
+def test_sigma_holds_how_wrong_a_law_is() -> None:
+    causes = {c.effect: c for c in verdict({("mass",): 60.0}).causes}
+    assert causes["mass"].sigma[0] == pytest.approx(np.hypot(0.1, 0.1 * 2.0))
+    assert causes["gyro_scale"].sigma[0] == pytest.approx(np.hypot(0.1, 0.03 * 2.0))

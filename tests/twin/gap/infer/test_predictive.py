@@ -1,0 +1,59 @@
+"""The metric of the judged runs is the inverse of the covariance that references predict for their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.infer.predictive import Products, energies, metric
+
+T, P, Q, N = 2, 3, 2, (40, 25)
+SIGMA = np.array([0.5, 2.0])
+ROBOT = RobotOffsets(
+    np.array([0.3, -0.2, 0.1]), np.diag([1.0, 0.3, 0.1]) + 0.02, np.array([0.02, 0.1, 0.3]), 9
+)
+
+
+def run(seed: int, error: np.ndarray | None = None) -> tuple[np.ndarray, Products]:
+    """Columns of a run with two channels, and its products."""
+    X = np.random.default_rng(seed).standard_normal((sum(N), T + P + Q + 1))
+    if error is not None:
+        X[:, -1] = error
+    parts = X[: N[0]], X[N[0] :]
+    return X, Products(np.stack([x.T @ x for x in parts]), T, P, np.array(N, dtype=float))
+
+
+def covariance(runs: list[np.ndarray], noise: np.ndarray) -> np.ndarray:
+    """Of the errors of several runs, which share the robot's offsets."""
+    stacked = np.vstack([X[:, T : T + P] for X in runs])
+    out = stacked @ ROBOT.covariance @ stacked.T
+    at = 0
+    for X in runs:
+        J, own, mine = X[:, :T], X[:, T : T + P], slice(at, at + len(X))
+        out[mine, mine] += np.diag(noise) + (J * SIGMA**2) @ J.T + (own * ROBOT.scatter) @ own.T
+        at += len(X)
+    return out
+
+
+@pytest.mark.parametrize("weight", [np.ones(2), np.array([1.0, 0.25])])
+def test_products_in_the_metric_are_those_by_the_whole_covariance(weight: np.ndarray) -> None:
+    made = [run(1), run(2)]
+    columns = [X for X, _ in made]
+    inverse = np.linalg.inv(covariance(columns, 1.0 / np.repeat(weight, N)))
+    e = np.concatenate([X[:, -1] - X[:, T : T + P] @ ROBOT.mean for X in columns])
+    all_ = np.column_stack([np.vstack([X[:, T:-1] for X in columns]), e])
+    m = metric([products for _, products in made], weight, SIGMA, ROBOT)
+    np.testing.assert_allclose(m.K[:-1, :-1], all_.T @ inverse @ all_, atol=1e-8)
+    assert not m.K[m.none].any()
+
+
+def test_what_states_and_robot_explain_is_no_energy() -> None:
+    X, _ = run(3)
+    noise = 0.1 * np.random.default_rng(4).standard_normal(sum(N))
+    used = np.array([1.5, -2.0])
+    error = X[:, :T] @ (0.5, 1.0) + X[:, T : T + P] @ ROBOT.mean + X[:, T + P : -1] @ used + noise
+    _, products = run(3, error)
+    with_it, without = (energies(products, u, np.ones(2), SIGMA, ROBOT) for u in (used, 0.0 * used))
+    assert (with_it < 0.1).all()
+    assert (without > 1.0).all()

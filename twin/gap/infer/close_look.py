@@ -1,0 +1,109 @@
+"""Close look at a few laws: alone, in pairs and triples, each with the discrepancy of its form.
+
+A law is never quite the robot's. Its signature times functions of the commands, which a law of another form
+would depend on, joins the covariance in proportion to the size of the effect (after Kennedy and O'Hagan 2001,
+with a basis in place of a Gaussian process).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.infer.bank import SignatureBank
+from terrafusion.twin.gap.infer.predictive import Metric, Products
+from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
+from terrafusion.twin.gap.rollout.nuisance import BASIS, command_basis
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+
+FUNCTIONS = ("speed", "abs_turn", "turn_rate", "acceleration")
+"""Factors of a law's signature, with time, each of mean zero and variance one over a run."""
+DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a fifth of the signature)
+PAIRS, FIRST, TRIPLES = 30, 5, 3
+"""Pairs that are fitted: the best to first sight, and all of the best laws; pairs that get a third law."""
+
+
+@dataclass(frozen=True, eq=False)
+class CloseLook:
+    """Laws examined, by index, and the columns of the discrepancy of each in the metric."""
+
+    metric: Metric
+    laws: Laws
+    index: tuple[int, ...]
+    extra: Mapping[int, Array]
+
+    def with_discrepancy(self, laws: Sequence[int]) -> tuple[Metric, float]:
+        """The metric with the discrepancy of some laws in the covariance, and what that adds to the log
+        likelihood of no effect."""
+        D, K, e = np.concatenate([self.extra[i] for i in laws]), self.metric.K, self.metric.error
+        L = np.linalg.cholesky(K[np.ix_(D, D)] + np.eye(len(D)) / DISCREPANCY**2)
+        half = np.linalg.solve(L, K[D])
+        less = half.T @ half
+        share = 0.5 * less[e, e] - float(np.log(np.diag(L)).sum()) - len(D) * math.log(DISCREPANCY)
+        return Metric(K - less, self.metric.shared), float(share)
+
+    def fit(self, laws: Sequence[int]) -> Fitted:
+        """Some laws together."""
+        metric, share = self.with_discrepancy(laws)
+        found = self.laws.fit(metric, laws)
+        return dataclasses.replace(found, gain=found.gain + share, evidence=found.evidence + share)
+
+    def search(self) -> dict[tuple[int, ...], Fitted]:
+        """Fits of all laws alone, of all pairs that look promising, and of the best of these with a third."""
+        names = self.laws.names
+        found: dict[tuple[int, ...], Fitted] = {(i,): self.fit((i,)) for i in self.index}
+        order = sorted(self.index, key=lambda i: -found[i,].evidence)
+        guess = self._pairs()
+        pairs = {*sorted(guess, key=lambda pair: -guess[pair])[:PAIRS]}
+        pairs |= {(min(p), max(p)) for p in itertools.combinations(order[:FIRST], 2)} & guess.keys()
+        found |= {pair: self.fit(pair) for pair in sorted(pairs)}
+        for pair in sorted(pairs, key=lambda pair: -found[pair].evidence)[:TRIPLES]:
+            present = {names[i].effect for i in pair}
+            more = {tuple(sorted((*pair, i))) for i in self.index if names[i].effect not in present}
+            found |= {three: self.fit(three) for three in sorted(more - found.keys())}
+        return found
+
+    def _pairs(self) -> dict[tuple[int, int], float]:
+        """Log likelihood ratio of every pair of effects to first sight: one at its best alone, the other
+        beside it."""
+        m, names, out = self.metric, self.laws.names, dict[tuple[int, int], float]()
+        gains, _, used = self.laws.best(m, m.K[:, m.error])
+        for a in self.index:
+            beside, _, _ = self.laws.best(m, m.K[:, m.error] - m.K @ used[a])
+            for b in self.index:
+                if names[a].effect != names[b].effect:
+                    pair = (min(a, b), max(a, b))
+                    out[pair] = max(out.get(pair, -np.inf), float(gains[a] + beside[b]))
+        return out
+
+
+def products_with_discrepancy(
+    runs: Sequence[WhitenedRun], model: Model, bank: SignatureBank, used: Mapping[int, Array]
+) -> tuple[list[Products], dict[int, Array]]:
+    """Inner products of the runs with the discrepancy of laws among the columns, and its columns in the
+    metric.
+
+    Args:
+        used: (M + 1,) coefficients of each law's signature at its size.
+    """
+    shared, count, F = runs[0].by_parameter.shape[1], bank.signatures[0].shape[1], len(FUNCTIONS) + 1
+    out = []
+    for run, signatures in zip(runs, bank.signatures, strict=True):
+        f, own = modulation(run, model), np.column_stack([run.by_parameter, signatures])
+        parts = [(own @ w[: own.shape[1]])[:, None] * f for w in used.values()]
+        out.append(Products.of(run, np.column_stack([signatures, *parts])))
+    return out, {i: shared + count + F * k + np.arange(F) for k, i in enumerate(used)}
+
+
+def modulation(run: WhitenedRun, model: Model) -> Array:
+    """Factors (n, F) of a signature."""
+    f = np.column_stack([command_basis(run.log, model, run.time_s), run.time_s])
+    f = f[:, [*map(BASIS.index, FUNCTIONS), -1]]
+    return np.asarray((f - f.mean(axis=0)) / np.maximum(f.std(axis=0), 1e-9))

@@ -1,0 +1,240 @@
+"""Explains a gap by the effects that caused it, or by a cause outside the catalogue.
+
+A first look ranks all laws, alone and beside each of the best few. The twin is then simulated at the best
+sizes of the promising ones, which a close look compares alone, in pairs and triples. Where even the best of
+them leaves more in a channel than the references do, the noise of that channel is taken to be larger.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.infer.bank import Point, SignatureBank
+from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
+from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
+from terrafusion.twin.gap.null.evidence import GapEvidence
+from terrafusion.twin.gap.rollout.residuals import soil_columns
+
+Sets = tuple[str, ...]  # names of effects that act together, sorted
+
+FIRST, BESIDE, TRIED = 12, 5, 4
+"""Laws that get a close look: the best alone, and the best beside each of the best few."""
+ROUNDS = 2  # in which the twin is simulated at the best sizes; in which channels are weighted
+CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
+LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
+SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
+"""Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
+much as a law is wrong."""
+UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What the judged runs say about sets of effects.
+
+    Attributes:
+        evidence: log evidence by set.
+        fits: of each set's best laws.
+        outside: log evidence of a cause outside the catalogue.
+        alike: by effect, those whose whole signatures nearly coincide with its own at their sizes.
+        left_out: gives the values of a set's best laws fitted without each run, one tuple a run.
+    """
+
+    evidence: dict[Sets, float]
+    fits: dict[Sets, Fitted]
+    outside: float
+    alike: dict[str, set[str]]
+    left_out: Callable[[Fitted], list[tuple[Array, ...]]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Explainer:
+    evidence: GapEvidence
+    sigma: Array
+    robot: RobotOffsets
+    without: Collection[str]
+
+    def metric(self, runs: Sequence[Products], weight: Array | None = None) -> Metric:
+        weight = np.ones(len(self.evidence.channels)) if weight is None else weight
+        return metric(runs, weight, self.sigma, self.robot)
+
+    def look(self, bank: SignatureBank) -> tuple[list[Products], Metric, Laws]:
+        runs = [Products.of(r, s) for r, s in zip(self.evidence.runs, bank.signatures, strict=True)]
+        m = self.metric(runs)
+        return runs, m, Laws.of(self.evidence.candidates, bank.ladders, m.shared, m.none)
+
+    def points(
+        self, runs: Sequence[Products], laws: Laws, bank: SignatureBank, sizes: Mapping[int, list[Array]],
+        used: Sequence[Array],
+    ) -> list[Point]:  # fmt: skip
+        """Where the twin has not been simulated near the best sizes, each run on the soil that fits it beside
+        the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
+        limit, soil, out = self.evidence.soil_limit, soil_columns(self.evidence.candidates), list[Point]()
+        for i, some in sizes.items():
+            law = laws.names[i]
+            if law not in bank.ladders:
+                continue
+            own = np.array([run.fitted_states(used[i][:-2], self.sigma, self.robot) for run in runs])
+            own = own[:, : len(limit)]
+            for k in (soil.index(column) for column in law.columns if column in soil):
+                own[:, k] -= own[:, k].mean()
+            soils, at = list(np.clip(own, -limit, limit)), bank.ladders[law].at
+            new = [x for x in dict.fromkeys(float(v[0]) for v in some) if np.abs(at - x).min() > _near(x)]
+            out += [Point(law, x, soils) for x in new]
+        return out
+
+    def allowed(self, laws: Laws) -> list[int]:
+        left = {*self.without}
+        return [i for i, h in enumerate(laws.names) if not left & {h.effect, f"{h.effect}/{h.form}"}]
+
+    def promising(self, m: Metric, laws: Laws, alone: Mapping[int, Fitted]) -> dict[int, list[Array]]:
+        """Laws worth a close look, with the sizes at which to simulate them."""
+        order = sorted(alone, key=lambda i: -alone[i].evidence)
+        sizes = {i: [alone[i].values[0]] for i in order[:FIRST]}
+        for i in order[:TRIED]:
+            gains, values, _ = laws.best(m, m.K[:, m.error] - m.K @ alone[i].used)
+            others = [k for k in order if laws.names[k].effect != laws.names[i].effect]
+            for k in sorted(others, key=lambda k: -gains[k])[:BESIDE]:
+                sizes.setdefault(k, []).append(values[k])
+        return sizes
+
+    def outside(self, m: Metric) -> float:
+        """Log evidence of a change along the whole nuisance basis."""
+        basis = np.arange(len(self.evidence.candidates.keys), m.shared)
+        values, vectors = np.linalg.eigh(m.K[np.ix_(basis, basis)])
+        square = np.square(UNKNOWN_SIZES)[:, None]
+        grown = 1.0 + square * np.maximum(values, 0.0)
+        each = 0.5 * (square * (vectors.T @ m.K[basis, m.error]) ** 2 / grown - np.log(grown)).sum(axis=1)
+        return float(np.logaddexp.reduce(each) - math.log(len(each)))
+
+    def weights(self, runs: Sequence[Products], best: Fitted, weight: Array) -> Array:
+        """(C,) one over the factor by which the best set's rest is above the references', at least one."""
+        P = runs[0].shared
+        moved = dataclasses.replace(self.robot, mean=self.robot.mean + best.used[:P])
+        used = best.used[P:-2]
+        now = np.mean([energies(run, used, weight, self.sigma, moved) for run in runs], axis=0)
+        normal = np.ones(len(now))
+        if self.evidence.references:
+            ones, none = np.ones(len(weight)), np.zeros(0)
+            own = [Products.of(r, np.zeros((len(r.time_s), 0))) for r in self.evidence.references]
+            each = [energies(run, none, ones, self.sigma, self.robot) for run in own]
+            normal = np.maximum(np.mean(each, axis=0), LEAST_NORMAL)
+        return np.asarray(1.0 / np.maximum(now / normal, 1.0))
+
+
+def explain(
+    evidence: GapEvidence,
+    sigma: Array,
+    robot: RobotOffsets,
+    *,
+    close: bool,
+    without: Collection[str] = (),
+    bank: SignatureBank | None = None,
+) -> Explanation:
+    """Log evidence of sets of effects.
+
+    Args:
+        sigma: (T,) 1 sigma of the states.
+        close: whether to simulate the twin and look at pairs; without, only first-order evidence of each
+            effect alone.
+        without: effects, or forms of them (effect/form), that are left out.
+    """
+    own = _Explainer(evidence, sigma, robot, without)
+    bank = SignatureBank.of(evidence, simulate=close) if bank is None else bank
+    runs, m, laws = own.look(bank)
+    alone = {i: laws.fit(m, (i,)) for i in own.allowed(laws)}
+    if not close:
+        one: dict[tuple[int, ...], Fitted] = {(i,): fit for i, fit in alone.items()}
+        return _by_effect(one, alone, laws, own.outside(m), {}, lambda fit: [fit.values] * len(evidence.runs))
+    sizes = own.promising(m, laws, alone)
+    bank = bank.only(laws.names[i] for i in sizes)
+    runs, m, laws = own.look(bank)
+    gains, values, used = laws.best(m, m.K[:, m.error])
+    for _ in range(ROUNDS):
+        bank = bank.with_sizes(evidence, own.points(runs, laws, bank, sizes, used))
+        runs, m, laws = own.look(bank)
+        gains, values, used = laws.best(m, m.K[:, m.error])
+        best = max(sizes, key=lambda i: gains[i])
+        _, beside, _ = laws.best(m, m.K[:, m.error] - m.K @ used[best])
+        sizes = {i: [values[i]] + [beside[i]] * (len(some) > 1) for i, some in sizes.items()}
+    runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, {i: used[i] for i in sizes})
+    weight, before = np.ones(len(evidence.channels)), np.zeros(0)
+    for _ in range(ROUNDS):
+        m = own.metric(runs, weight)
+        laws = Laws.of(evidence.candidates, bank.ladders, m.shared, m.none)
+        found = CloseLook(m, laws, tuple(sizes), extra).search()
+        top = max(found, key=lambda laws: found[laws].evidence - 5.0 * len(laws))
+        before, weight = weight, own.weights(runs, found[top], weight)
+        if np.allclose(before, weight, rtol=0.1):
+            break
+
+    def left_out(fit: Fitted) -> list[tuple[Array, ...]]:
+        if len(runs) == 1:
+            return [fit.values]
+        some = [laws.names.index(law) for law in fit.laws]
+        parts = [own.metric([r for r in runs if r is not run], before) for run in runs]
+        return [laws.fit(part, some).values for part in parts]
+
+    alike = _same_signatures(runs, {i: found[i,] for i in sizes})
+    return _by_effect(found, alone, laws, own.outside(m), alike, left_out)
+
+
+def _same_signatures(runs: Sequence[Products], fits: Mapping[int, Fitted]) -> dict[str, set[str]]:
+    """By effect, those whose signatures nearly coincide with its own before the ground is fitted."""
+    T, out = runs[0].states, dict[str, set[str]]()
+    G = np.sum([run.gram.sum(axis=0)[T:-1, T:-1] for run in runs], axis=0)
+    used = np.array([fit.used[:-2] for fit in fits.values()])
+    inner = used @ G @ used.T
+    size = np.sqrt(np.diag(inner))
+    names = [fit.laws[0].effect for fit in fits.values()]
+    for a, b in itertools.permutations(range(len(names)), 2):
+        seen = min(size[a], size[b]) > LEAST_SIGNATURE
+        if seen and names[a] != names[b] and abs(inner[a, b]) > SAME_SIGNATURE * size[a] * size[b]:
+            out.setdefault(names[a], set()).add(names[b])
+    return out
+
+
+def _by_effect(
+    found: Mapping[tuple[int, ...], Fitted],
+    alone: Mapping[int, Fitted],
+    laws: Laws,
+    outside: float,
+    alike: dict[str, set[str]],
+    left_out: Callable[[Fitted], list[tuple[Array, ...]]],
+) -> Explanation:
+    """Sets of laws by their effects: forms are alternatives of equal weight. Laws without a close look are as
+    far behind the best as at first look, or further."""
+    close = {i for some in found for i in some}
+    best = max((found[i,] for i in close), key=lambda fit: fit.evidence)
+    worst = min(alone[i].evidence for i in close)
+    every = dict(found)
+    for i in alone.keys() - close:
+        behind = max(worst - alone[i].evidence, 0.0)
+        lowest = min(found[k,].evidence for k in close)
+        every[i,] = dataclasses.replace(alone[i], evidence=min(lowest, best.evidence) - behind)
+    groups = dict[Sets, list[Fitted]]()
+    for some, fit in every.items():
+        groups.setdefault(tuple(sorted(laws.names[i].effect for i in some)), []).append(fit)
+    forms = Counter(law.effect for law in laws.names)
+    evidence = {
+        effects: float(np.logaddexp.reduce([fit.evidence for fit in some]))
+        - math.log(math.prod(forms[effect] for effect in effects))
+        for effects, some in groups.items()
+    }
+    fits = {effects: max(some, key=lambda fit: fit.evidence) for effects, some in groups.items()}
+    return Explanation(evidence, fits, outside, alike, left_out)
+
+
+def _near(size: float) -> float:
+    """How near to a size the twin need not be simulated once more."""
+    return CLOSE * max(abs(size), LEAST_SIZE)

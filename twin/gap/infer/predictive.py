@@ -1,0 +1,121 @@
+"""The judged runs in the metric of what references predict for them.
+
+The error of a run is e = J theta + P (phi + omega) + s + noise: theta its states, phi the robot's offsets in
+all columns P, known from the references as N(m, V), omega how they scatter from run to run, N(0, Omega) (see
+`other_drives`), and s the signature of what has changed. All that an inference about s needs are inner
+products in the inverse of the covariance of e - s, `Metric.K`: with w the coefficients of the columns that s
+is made of, its log likelihood ratio is w'K e - w'K w / 2.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Inner products of a run's columns by channel: states, effects and nuisance, signatures, error.
+
+    `states` and `shared` are the numbers of the first two; `samples` (C,) that of each channel.
+    """
+
+    gram: Array
+    states: int
+    shared: int
+    samples: Array
+
+    @classmethod
+    def of(cls, run: WhitenedRun, signatures: Array) -> Products:
+        """Of a run and its signatures (n, Q)."""
+        rows = run.rows.astype(float)
+        X = np.column_stack([rows[:, :-1], signatures, rows[:, -1]])
+        ends = np.searchsorted(run.channel, np.arange(len(run.limit) + 1))  # samples are sorted by channel
+        gram = np.stack([X[a:b].T @ X[a:b] for a, b in itertools.pairwise(ends)])
+        return cls(gram, run.states, rows.shape[1] - 1 - run.states, np.diff(ends).astype(float))
+
+    def fitted_states(self, used: Array, sigma: Array, robot: RobotOffsets) -> Array:
+        """States (T,) that fit what signatures leave; `used` are coefficients of all columns but states."""
+        T, P = self.states, self.shared
+        G = self.gram.sum(axis=0)
+        v = np.concatenate([-used, [1.0]])
+        v[:P] -= robot.mean
+        return np.asarray(np.linalg.solve(G[:T, :T] + np.diag(sigma**-2.0), G[:T, T:] @ v))
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """Inner products K (M + 1, M + 1) of the columns (effects and nuisance, signatures, error) of all runs
+    together; the last row and column are zero and stand for no signature."""
+
+    K: Array
+    shared: int
+
+    @property
+    def error(self) -> int:
+        """Index of the error."""
+        return len(self.K) - 2
+
+    @property
+    def none(self) -> int:
+        """Index of no signature."""
+        return len(self.K) - 1
+
+
+def metric(runs: Sequence[Products], weight: Array, sigma: Array, robot: RobotOffsets) -> Metric:
+    """The metric of judged runs.
+
+    Args:
+        weight: (C,) of each channel: one over the factor of its noise's variance.
+        sigma: (T,) 1 sigma of the states.
+    """
+    P = runs[0].shared
+    total = np.zeros((runs[0].gram.shape[1] - len(sigma),) * 2)
+    for run in runs:
+        rest = without_states(run, weight, sigma)
+        rest[:, -1] -= rest[:, :P] @ robot.mean
+        rest[-1] -= robot.mean @ rest[:P]
+        total += beyond_scatter(rest, robot)
+    total = beyond_robot(total, robot)
+    return Metric(np.pad(0.5 * (total + total.T), (0, 1)), P)
+
+
+def beyond_scatter(products: Array, robot: RobotOffsets) -> Array:
+    """A run's inner products (M, M), whose first columns are P, with omega projected out."""
+    P = len(robot.mean)
+    own = np.linalg.solve(np.diag(1.0 / robot.scatter) + products[:P, :P], products[:P])
+    return products - products[:, :P] @ own
+
+
+def beyond_robot(products: Array, robot: RobotOffsets) -> Array:
+    """Inner products (M, M) of all runs with phi projected out."""
+    P, V = len(robot.mean), robot.covariance
+    own = np.linalg.solve(np.eye(P) + V @ products[:P, :P], V @ products[:P])
+    return products - products[:, :P] @ own
+
+
+def without_states(run: Products, weight: Array, sigma: Array) -> Array:
+    """Inner products of all columns but the states, which are projected out with their prior."""
+    G, T = np.tensordot(weight, run.gram, axes=1), len(sigma)
+    rest = G[T:, T:] - G[T:, :T] @ np.linalg.solve(G[:T, :T] + np.diag(sigma**-2.0), G[:T, T:])
+    return np.asarray(rest)
+
+
+def energies(run: Products, used: Array, weight: Array, sigma: Array, robot: RobotOffsets) -> Array:
+    """Mean squared error (C,) of each channel with signatures (coefficients (Q,)) subtracted and the best
+    states and robot offsets beside them."""
+    T, P = len(sigma), run.shared
+    G = np.tensordot(weight, run.gram, axes=1)
+    v = np.concatenate([np.zeros(T), -robot.mean, -used, [1.0]])
+    prior = np.zeros((T + P, T + P))
+    prior[:T, :T] = np.diag(sigma**-2.0)
+    prior[T:, T:] = np.linalg.inv(robot.covariance + np.diag(robot.scatter))
+    v[: T + P] -= np.linalg.solve(G[: T + P, : T + P] + prior, G[: T + P] @ v)
+    return np.maximum(np.einsum("cij,i,j->c", run.gram, v, v), 1e-9) / np.maximum(run.samples, 1.0)
