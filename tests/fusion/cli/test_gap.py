@@ -27,6 +27,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Path, terrafusion) -> None:
     arguments = ["gap", str(logs / "run300"), str(logs / "run301"), "--out", str(tmp_path / "out")]
+    arguments += ["--effects", "wheel_radius,grousers,mass"]
     for i in range(6):
         arguments += ["--reference", str(logs / f"run{100 + i}")]
     done = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"))

@@ -49,7 +49,7 @@ class Ladder:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class SimulatedSize:
     """A law at a size, beside which each run is on a soil (S,), typical sizes from the model's."""
 
     law: Hypothesis
@@ -68,7 +68,7 @@ class SignatureBank:
     def of(cls, evidence: GapEvidence, simulate: bool = True) -> SignatureBank:
         """All laws that are not linear: at one typical size by their sensitivity, which costs nothing, and
         beyond by rollout, unless `simulate` is false."""
-        ladders, candidates, points = dict[Hypothesis, Ladder](), evidence.candidates, list[Point]()
+        ladders, candidates, points = dict[Hypothesis, Ladder](), evidence.candidates, list[SimulatedSize]()
         soils = [np.zeros(len(evidence.soil_limit))] * len(
             evidence.runs
         )  # a run's own holds a part of the effect
@@ -93,7 +93,7 @@ class SignatureBank:
                 far += [end / GROWTH] * (abs(end) > GROWTH**1.5) + [end] * (abs(end) > 1.0)
             near.sort()
             ladders[law] = Ladder(law, np.array([x for x, _ in near]), tuple(c for _, c in near))
-            points += [Point(law, x, soils) for x in far]
+            points += [SimulatedSize(law, x, soils) for x in far]
         empty = [np.zeros((len(run.time_s), 0)) for run in evidence.runs]
         bank = cls(ladders, [np.column_stack([e, *mine]) for e, mine in zip(empty, first, strict=True)])
         return bank.with_sizes(evidence, points) if simulate else bank
@@ -111,7 +111,7 @@ class SignatureBank:
                 )
         return SignatureBank(kept, [s[:, columns] for s in self.signatures])
 
-    def with_sizes(self, evidence: GapEvidence, points: Sequence[Point]) -> SignatureBank:
+    def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> SignatureBank:
         """With further sizes of laws; those at which the twin diverges are left out."""
         runs = range(len(evidence.runs))
         effects = [effects_at(evidence, p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.infer.bank import Point, SignatureBank
+from terrafusion.twin.gap.infer.bank import SimulatedSize, SignatureBank
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
@@ -76,10 +76,14 @@ class _Explainer:
     def points(
         self, runs: Sequence[Products], laws: Laws, bank: SignatureBank, sizes: Mapping[int, list[Array]],
         used: Sequence[Array],
-    ) -> list[Point]:  # fmt: skip
+    ) -> list[SimulatedSize]:  # fmt: skip
         """Where the twin has not been simulated near the best sizes, each run on the soil that fits it beside
         the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
-        limit, soil, out = self.evidence.soil_limit, soil_columns(self.evidence.candidates), list[Point]()
+        limit, soil, out = (
+            self.evidence.soil_limit,
+            soil_columns(self.evidence.candidates),
+            list[SimulatedSize](),
+        )
         for i, some in sizes.items():
             law = laws.names[i]
             if law not in bank.ladders:
@@ -90,7 +94,7 @@ class _Explainer:
                 own[:, k] -= own[:, k].mean()
             soils, at = list(np.clip(own, -limit, limit)), bank.ladders[law].at
             new = [x for x in dict.fromkeys(float(v[0]) for v in some) if np.abs(at - x).min() > _near(x)]
-            out += [Point(law, x, soils) for x in new]
+            out += [SimulatedSize(law, x, soils) for x in new]
         return out
 
     def allowed(self, laws: Laws) -> list[int]:

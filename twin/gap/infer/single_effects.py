@@ -150,7 +150,7 @@ class Laws:
         H = np.column_stack(C).T @ m.K @ np.column_stack(C)
         H += RIDGE * np.eye(len(H))
         share, at, out = -0.5 * float(np.linalg.slogdet(H)[1]), 0, list[Array]()
-        inverse: Array = np.linalg.inv(H)
+        inverse: Array = np.asarray(np.linalg.inv(H), dtype=np.float64)
         for i, v, c in zip(laws, values, C, strict=True):
             k, size = c.shape[1], max(float(np.linalg.norm(v)), SMALLEST)
             low, high = self.candidates.bounds(self.names[i].columns)
