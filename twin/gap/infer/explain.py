@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.infer.bank import SimulatedSize, SignatureBank
+from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
