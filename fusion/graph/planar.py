@@ -20,7 +20,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preintegrator
+from terrafusion.fusion.graph.preintegration import Preintegrator, combined_params
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -115,22 +115,19 @@ class PlanarPreintegrator(Preintegrator):
         super().__init__(spec)
         self.yaw = yaw
 
-    def integrate(
-        self,
-        segments: list[ImuSegment],
-        bias: gtsam.imuBias.ConstantBias,
-        noise: SensorNoise,
-    ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; of `noise` only the inflation about yaw acts."""
+    def params(self, segments: list[ImuSegment], noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
+        """Noise of the segments; of `noise` only the inflation about yaw acts."""
         turned = sum(float(segment.gyro_radps[2]) * segment.dt_s for segment in segments)
         total = sum(segment.dt_s for segment in segments)
-        density = self.yaw_density(turned / total if total > 0.0 else 0.0, noise.gyro_yaw_inflation)
-        forces = segments[0].accel_density_mps2 if segments else None
-        params = self._planar(density, forces or (ACCEL_DENSITY_MPS2, ACCEL_DENSITY_MPS2))
-        measured = gtsam.PreintegratedCombinedMeasurements(params, bias)
-        for segment in segments:
-            measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
-        return measured
+        yaw = self.yaw_density(turned / total if total > 0.0 else 0.0, noise.gyro_yaw_inflation)
+        forward = segments[0].accel_density_mps2 if segments else None
+        walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw in BIASED else _BIAS_WALK
+        return combined_params(
+            np.array([TILT_DENSITY_RADPS, TILT_DENSITY_RADPS, yaw]),
+            np.array([*(forward or (ACCEL_DENSITY_MPS2, ACCEL_DENSITY_MPS2)), ACCEL_DENSITY_MPS2]),
+            np.array([_BIAS_WALK, _BIAS_WALK, walk]),
+            _BIAS_WALK,
+        )
 
     def yaw_density(self, rate_radps: float, inflation: float) -> float:
         """Noise density of the yaw rate, rad/s/sqrt(Hz), while turning at `rate_radps`."""
@@ -145,18 +142,6 @@ class PlanarPreintegrator(Preintegrator):
             else (TURN_SHARE, WHEEL_YAW_DENSITY_RADPS)
         )
         return float(np.hypot(share * rate_radps * np.sqrt(TURN_TIME_S), floor))
-
-    def _planar(self, yaw_density: float, accel: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
-        eye = np.eye(3)
-        params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
-        params.setGyroscopeCovariance(np.diag([TILT_DENSITY_RADPS**2, TILT_DENSITY_RADPS**2, yaw_density**2]))
-        params.setAccelerometerCovariance(np.diag([accel[0] ** 2, accel[1] ** 2, ACCEL_DENSITY_MPS2**2]))
-        walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw in BIASED else _BIAS_WALK
-        params.setBiasOmegaCovariance(np.diag([_BIAS_WALK**2, _BIAS_WALK**2, walk**2]))
-        params.setBiasAccCovariance(eye * _BIAS_WALK**2)
-        params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
-        params.setBodyPSensor(gtsam.Pose3())  # a snapshot knows factors with a lever arm only
-        return params
 
 
 def planar_spec(spec: ImuSpec, yaw: str) -> ImuSpec:

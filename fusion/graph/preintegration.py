@@ -8,6 +8,7 @@ import math
 import gtsam
 import numpy as np
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.inputs.streams import ImuSegment
@@ -36,33 +37,55 @@ class Preintegrator:
         bias: gtsam.imuBias.ConstantBias,
         noise: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; the inflations of `noise` multiply the data sheet's noise.
-
-        With a replaced spike the sensor's noise is inflated by `HELD_INFLATION`.
-        """
-        noise = _less_sure(noise, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
-        measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(noise), bias)
+        """Preintegrate the segments about `bias`."""
+        measured = gtsam.PreintegratedCombinedMeasurements(self.params(segments, noise), bias)
         for segment in segments:
             measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
         return measured
 
-    def _scaled(self, noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
+    def params(self, segments: list[ImuSegment], noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
+        """Noise of the segments: the data sheet's times the inflations of `noise`.
+
+        With a replaced spike the sensor's noise is inflated by `HELD_INFLATION`.
+        """
+        noise = _less_sure(noise, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
         # Steps of 5 % keep the number of parameter sets small.
         inflations = *noise.gyro_axes(), noise.accel_inflation
         key = tuple(round(math.log(inflation) / STEP) for inflation in inflations)
         if key not in self._params:
-            spec, eye = self.spec, np.eye(3)
+            spec = self.spec
             *about, accel = (math.exp(STEP * steps) for steps in key)
-            gyro = spec.gyro_noise_radps_sqrthz * np.array(about)
-            params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
-            params.setGyroscopeCovariance(np.diag(gyro**2))
-            params.setAccelerometerCovariance(eye * (spec.accel_noise_mps2_sqrthz * accel) ** 2)
-            params.setBiasOmegaCovariance(eye * spec.gyro_bias_walk_radps2_sqrthz**2)
-            params.setBiasAccCovariance(eye * spec.accel_bias_walk_mps3_sqrthz**2)
-            params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
-            params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(), np.array(spec.position_m)))
-            self._params[key] = params
+            self._params[key] = combined_params(
+                spec.gyro_noise_radps_sqrthz * np.array(about),
+                spec.accel_noise_mps2_sqrthz * accel,
+                spec.gyro_bias_walk_radps2_sqrthz,
+                spec.accel_bias_walk_mps3_sqrthz,
+                spec.position_m,
+            )
         return self._params[key]
+
+
+def combined_params(
+    gyro: Array | float,
+    accel: Array | float,
+    gyro_walk: Array | float,
+    accel_walk: Array | float,
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> gtsam.PreintegrationCombinedParams:
+    """Parameters by noise densities and random walks, each of all axes or (3,), and the IMU's place (3,)."""
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
+    params.setGyroscopeCovariance(_diagonal(gyro))
+    params.setAccelerometerCovariance(_diagonal(accel))
+    params.setBiasOmegaCovariance(_diagonal(gyro_walk))
+    params.setBiasAccCovariance(_diagonal(accel_walk))
+    params.setIntegrationCovariance(_diagonal(INTEGRATION_SIGMA_M))
+    # A snapshot knows factors with a lever arm only, if of zero length.
+    params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(), np.array(position_m)))
+    return params
+
+
+def _diagonal(sigma: Array | float) -> Array:
+    return np.asarray(np.eye(3) * sigma**2)
 
 
 def _less_sure(noise: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
