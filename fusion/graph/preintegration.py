@@ -70,7 +70,7 @@ def combined_params(
     accel: Array | float,
     gyro_walk: Array | float,
     accel_walk: Array | float,
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position_m: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> gtsam.PreintegrationCombinedParams:
     """Parameters by noise densities and random walks, each of all axes or (3,), and the IMU's place (3,)."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
