@@ -2,7 +2,7 @@
 
 The parameters of each effect's first form are all free at once. The twin is calibrated to the references,
 each reference gives one estimate more (their scatter goes into sigma), and the judged runs are fitted
-together by `scipy.optimize.least_squares` on rollouts of the same twin. An effect is claimed where change
+together (bounded Gauss-Newton with a line search) on rollouts of the same twin. An effect is claimed where change
 over sigma is significant (Student's t, Bonferroni over all parameters); the largest is ranked first.
 """
 
@@ -30,10 +30,10 @@ from terrafusion.twin.model.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-PRIOR = 10.0  # 1 sigma of every parameter in typical sizes: bounds what the data leave open
+PRIOR = 3.0  # 1 sigma of every parameter in typical sizes: bounds what the data leave open
 CALIBRATION_RUNS, FEWEST_REFERENCES, STEPS = 3, 3, 4
+SHARES, ENOUGH = (1.0, 0.5, 0.25, 0.1), 1e-3  # of a step that are tried; least relative gain of a further one
 LEAST_SIGMA = 0.2  # least sigma of a channel in that of its data sheet
-INSIDE = 1e-6  # the fit starts so far inside its bounds
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,41 @@ class _Fit:
 
     def one_step(self, x: Array, logs: Sequence[PreparedLog]) -> Array:
         """Bounded Gauss-Newton step from x on the logs together."""
+        return self._step(x, logs)[0]
+
+    def minimum(self, x: Array, logs: Sequence[PreparedLog]) -> tuple[Array, Array]:
+        """Bounded least squares from x: parameters (P,) of the logs together, and information (P, P) there.
+
+        Gauss-Newton with a line search: the trust regions of `scipy.optimize.least_squares` stall where
+        parameters start on their bounds.
+        """
+        cost = self._cost(x, logs)
+        for _ in range(STEPS):
+            goal, information = self._step(x, logs)
+            trials = [x + share * (goal - x) for share in SHARES]
+            found = ((self._cost(trial, logs), trial) for trial in trials)
+            better = next(((c, trial) for c, trial in found if c < cost), None)
+            if better is None:
+                break
+            done = better[0] > (1.0 - ENOUGH) * cost
+            cost, x = better
+            if done:
+                break
+        return x, information
+
+    def _cost(self, x: Array, logs: Sequence[PreparedLog]) -> float:
+        squares = sum(float(np.sum(self.of(log, x, False)[0] ** 2)) for log in logs)
+        return squares + float(np.sum((x / PRIOR) ** 2))
+
+    def _step(self, x: Array, logs: Sequence[PreparedLog]) -> tuple[Array, Array]:
         from scipy.optimize import lsq_linear
 
         parts = [self.of(log, x) for log in logs]
         information = sum((J.T @ J for _, J in parts), np.eye(len(x)) / PRIOR**2)
         factor = np.linalg.cholesky(information).T
-        gradient = sum((J.T @ e for e, J in parts), np.zeros(len(x)))
+        gradient = sum((J.T @ e for e, J in parts), x / PRIOR**2)
         goal = factor @ x - np.linalg.solve(factor.T, gradient)
-        return np.asarray(lsq_linear(factor, goal, (self.low, self.high)).x)
+        return np.asarray(lsq_linear(factor, goal, (self.low, self.high)).x), information
 
 
 def first_forms(every: Candidates) -> Candidates:
@@ -121,8 +148,6 @@ def joint_least_squares(
         DataError: too few references, or a log lacks a channel that is needed.
         TerrafusionError: the twin diverges.
     """
-    from scipy.optimize import least_squares
-
     if len(references) < FEWEST_REFERENCES:
         raise DataError(f"{len(references)} references", remedy=f"give at least {FEWEST_REFERENCES}")
     candidates = first_forms(Candidates.of())
@@ -132,18 +157,11 @@ def joint_least_squares(
     fit = _Fit(model, candidates)
     base = fit.calibrated(normal[:CALIBRATION_RUNS])
     single = np.array([fit.one_step(base, [log]) for log in normal])
-    prior = np.eye(len(base)) / PRIOR
-    found = least_squares(
-        lambda x: np.concatenate([*(fit.of(log, x, False)[0] for log in judged), prior @ (x - base)]),
-        np.clip(base, fit.low + INSIDE, fit.high - INSIDE),
-        lambda x: np.concatenate([*(fit.of(log, x)[1] for log in judged), prior]),
-        (fit.low, fit.high),
-        max_nfev=STEPS,
-    )
+    x, information = fit.minimum(base, judged)
     scatter = single.var(axis=0, ddof=1)
-    variance = np.maximum(np.diag(np.linalg.inv(found.jac.T @ found.jac)), scatter / len(judged))
+    variance = np.maximum(np.diag(np.linalg.inv(information)), scatter / len(judged))
     sigma = np.sqrt(variance + scatter / len(single))
-    return LeastSquaresAnswer(_claims(fit, found.x - single.mean(axis=0), sigma, len(single)))
+    return LeastSquaresAnswer(_claims(fit, x - single.mean(axis=0), sigma, len(single)))
 
 
 def _claims(fit: _Fit, change: Array, sigma: Array, references: int) -> dict[str, Any]:
