@@ -2,8 +2,8 @@
 
 The parameters of each effect's first form are all free at once. The twin is calibrated to the references,
 each reference gives one estimate more (their scatter goes into sigma), and the judged runs are fitted
-together (bounded Gauss-Newton with a line search) on rollouts of the same twin. An effect is claimed where change
-over sigma is significant (Student's t, Bonferroni over all parameters); the largest is ranked first.
+together (bounded Gauss-Newton with a line search) on rollouts of the same twin. An effect is claimed where
+change over sigma is significant (Student's t, Bonferroni over all parameters); the largest is ranked first.
 """
 
 from __future__ import annotations
