@@ -26,10 +26,10 @@ def run_of(mode: str, seed: int, outside_m: float, inside_m: float, end_m: float
             (0.05, 0.3, 1.0),
             "Adaptive weights help in every drive shown here; on firm ground they equal fixed ones.",
         ),
-        ((0.1, 0.3, 1.0), "Where adaptive weights do not help: it is even with GNSS."),
+        ((0.1, 0.3, 1.0), "Where adaptive weights do not help: they equal fixed ones with GNSS."),
         (
             (0.05, 0.6, 3.0),
-            "Where adaptive weights do not help: it is worse in the outage and at the end of the outage; "
+            "Where adaptive weights do not help: they are worse in the outage and at the end of the outage; "
             "2 of 2 drives end the outage with a larger error.",
         ),
     ],
