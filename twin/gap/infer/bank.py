@@ -21,7 +21,6 @@ from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.delay import DELAYS
-from terrafusion.twin.gap.rollout.residuals import whitened_error
 
 GROWTH = 3.0
 """Factor from one simulated size to the next."""
@@ -116,25 +115,25 @@ class SignatureBank:
         runs = range(len(evidence.runs))
         effects = [effects_at(evidence, p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
         tried = [RunWithEffects(r, e, p.soils[r]) for p, e in zip(points, effects, strict=True) for r in runs]
+        tried += [RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs]
         # Unclipped: a large effect is no outlier.
         errors = whitened_errors(evidence, tried, clip=False)
-        plain = [
-            whitened_error(r, white, evidence.noise, r.error, clip=False)
-            for r, white in zip(evidence.residuals, evidence.runs, strict=True)
-        ]
+        errors, plain = errors[: len(tried) // 2], errors[len(tried) // 2 :]
         new: list[list[Array]] = [[] for _ in runs]
         found: dict[Hypothesis, list[tuple[float, int]]] = {
             law: list(zip(old.at.tolist(), old.column, strict=True)) for law, old in self.ladders.items()
         }
         count = self.signatures[0].shape[1]
         for i, point in enumerate(points):
-            mine = [error for error in errors[i * len(runs) : (i + 1) * len(runs)] if error is not None]
-            if len(mine) < len(runs):
+            own = slice(i * len(runs), (i + 1) * len(runs))
+            mine = [error for error in errors[own] if error is not None]
+            without = [error for error in plain[own] if error is not None]
+            if len(mine) < len(runs) or len(without) < len(runs):
                 continue
             known = found.setdefault(point.law, [(0.0, -1)])
             apart = [step for step in known if abs(step[0] - point.size) >= APART * abs(point.size)]
             found[point.law] = [*apart, (point.size, count + len(new[0]))]
-            for signatures, whole, error in zip(new, plain, mine, strict=True):
+            for signatures, whole, error in zip(new, without, mine, strict=True):
                 signatures.append(whole - error)
         ladders = dict(self.ladders)
         for law, steps in found.items():

@@ -1,8 +1,9 @@
 """Explains a gap by the effects that caused it, or by a cause outside the catalogue.
 
 A first look ranks all laws, alone and beside each of the best few. The twin is then simulated at the best
-sizes of the promising ones, which a close look compares alone, in pairs and triples. Where even the best of
-them leaves more in a channel than the references do, the noise of that channel is taken to be larger.
+sizes of the promising ones, which a close look compares alone, in pairs and triples; what they explain on
+references is subtracted. Where even the best of them leaves more in a channel than the references do, the
+noise of that channel is taken to be larger.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
+from terrafusion.twin.gap.infer.chance import ReferenceGains
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
@@ -181,6 +183,11 @@ def explain(
         before, weight = weight, own.weights(runs, found[top], weight)
         if np.allclose(before, weight, rtol=0.1):
             break
+    chance = ReferenceGains.of(evidence, sigma, before, laws, {i: found[i,] for i in sizes}, laws.planes)
+    found = {
+        some: dataclasses.replace(fit, evidence=fit.evidence - chance.most(some))
+        for some, fit in found.items()
+    }
 
     def left_out(fit: Fitted) -> list[tuple[Array, ...]]:
         if len(runs) == 1:

@@ -43,7 +43,7 @@ class GapEvidence:
         channels: observed channels.
         noise: of each channel.
         runs, references: whitened residuals of each.
-        residuals: those of the judged runs before whitening.
+        residuals, reference_residuals: those of each before whitening.
         soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
         notes: assumptions, in sentences.
@@ -57,6 +57,7 @@ class GapEvidence:
     runs: list[WhitenedRun]
     references: list[WhitenedRun]
     residuals: list[RunResiduals]
+    reference_residuals: list[RunResiduals]
     soil_limit: Array
     cache: LinearisationCache
     notes: tuple[str, ...]
@@ -110,6 +111,6 @@ def gather_evidence(
     clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
-        model, candidates, channels, noise, *clipped, judged, limit, linearised,
+        model, candidates, channels, noise, *clipped, judged, normal, limit, linearised,
         tuple(dict.fromkeys(notes)), jobs,
     )  # fmt: skip

@@ -46,3 +46,16 @@ def test_a_large_effect_is_found_at_its_size(
     column = candidates.keys.index(key)
     assert column in fit.laws[0].columns
     assert float(fit.values[0][0]) * candidates.scale[column] == pytest.approx(truth, abs=within)
+
+
+def test_what_references_have_too_is_no_cause() -> None:
+    """An IMU that is late in all runs: its linear part is known from the references, the rest is not, and
+    gains as much on them as on the judged runs."""
+    name = "imu_time_offset"
+    candidates, late = Candidates.of([name, "gyro_scale"]), {"imu_time_offset/shift": 0.2}
+    given = runs(980, 2, late), runs(985, 6, late)
+    evidence = gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
+    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
+    robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+    found = explain(evidence, sigma, robot, close=True)
+    assert found.evidence[name,] < 0.0

@@ -1,0 +1,99 @@
+"""What laws explain on references, where nothing has changed.
+
+A nonlinear signature, or the discrepancy of a law, also fits what twin and robot always differ by, and how
+the ground scatters beyond what the random effects hold. Both are in references as in judged runs: what a set
+of laws gains on references, at the sizes of the judged runs but with free coefficients, is no sign of a
+change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
+from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
+from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets
+from terrafusion.twin.gap.infer.predictive import metric
+from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
+from terrafusion.twin.gap.null.evidence import GapEvidence
+from terrafusion.twin.gap.null.score import score
+
+RIDGE = 1e-3  # information on a coefficient beforehand
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReferenceGains:
+    """Groups of references, as many as there are judged runs where they suffice, each with offsets learned
+    from the others.
+
+    Attributes:
+        looks: of each group, with the columns of the discrepancy of each law.
+        column: columns of each law: those of a linear one, or its one signature.
+        share: number of judged runs over that of a group.
+    """
+
+    looks: tuple[CloseLook, ...]
+    column: Mapping[int, Array]
+    share: float
+
+    @classmethod
+    def of(
+        cls,
+        evidence: GapEvidence,
+        sigma: Array,
+        weight: Array,
+        laws: Laws,
+        alone: Mapping[int, Fitted],
+        linear: Collection[int],
+    ) -> ReferenceGains:
+        """Of laws at the sizes that fit the judged runs alone. Too few references make no group.
+
+        Args:
+            sigma: (T,) 1 sigma of the states.
+            weight: (C,) of each channel, as for `metric`.
+        """
+        references = evidence.references
+        size = min(len(evidence.runs), len(references) // 2)
+        if len(references) - size < FEWEST or not size:
+            return cls((), {}, 0.0)
+        there = dataclasses.replace(
+            evidence, runs=references, residuals=evidence.reference_residuals, references=[]
+        )
+        soils = [residuals.soil for residuals in evidence.reference_residuals]
+        at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in linear}
+        empty = SignatureBank({}, [np.zeros((len(run.time_s), 0)) for run in references])
+        bank = empty.with_sizes(there, [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x])
+        shared = references[0].by_parameter.shape[1]
+        column = {i: np.array(laws.names[i].columns) for i in alone if i in linear}
+        for i in at:
+            own = bank.ladders.get(laws.names[i])
+            column[i] = shared + np.array([c for c in own.column if c >= 0] if own else [], dtype=int)
+        used = {i: np.zeros(shared + bank.signatures[0].shape[1] + 2) for i in alone}
+        for i, fit in alone.items():
+            used[i][column[i]] = fit.values[0] if i in linear else 1.0
+        products, extra = products_with_discrepancy(references, evidence.model, bank, used)
+        scores, looks = [score(run, sigma) for run in references], list[CloseLook]()
+        effects = len(evidence.candidates.keys)
+        for first in range(0, len(references) - size + 1, size):
+            group = range(first, first + size)
+            robot = learn_offsets([s for i, s in enumerate(scores) if i not in group], effects)
+            group_metric = metric([products[i] for i in group], weight, sigma, robot)
+            looks.append(CloseLook(group_metric, laws, (), extra))
+        return cls(tuple(looks), column, len(evidence.runs) / size)
+
+    def most(self, laws: Sequence[int]) -> float:
+        """Log likelihood ratio of some laws together on references, as of so many runs as are judged: the
+        largest of any group, since groups are few and their gains differ widely."""
+        if not self.looks:
+            return 0.0
+        at = np.concatenate([self.column[i] for i in laws])
+        gains = []
+        for look in self.looks:
+            m, share = look.with_discrepancy(laws)
+            inner, b = m.K[np.ix_(at, at)], m.K[at, m.error]
+            gains.append(share + 0.5 * float(b @ np.linalg.solve(inner + RIDGE * np.eye(len(b)), b)))
+        return self.share * max(*gains, 0.0)
