@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -60,4 +61,5 @@ def test_a_check_that_ends_in_an_exception_is_broken(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(self_check, "_replay", fails)
     done = terrafusion("self-check", "--quiet")
-    assert (done.status, done.out) == (1, "1 of 12 checks failed\n")
+    assert done.status == 1
+    assert re.fullmatch(r"1 of \d+ checks failed\n", done.out)
