@@ -40,6 +40,8 @@ def test_other_gyros_are_taken(factor: float) -> None:
     estimator = Estimator.for_vehicle("elevate")
     for message in with_gyro_times(factor):
         estimator.add(message)
+    assert not estimator.gyro._unit.in_degrees
+    assert estimator.latest() is not None
 
 
 def turned(ratio: float, seconds: int, noise_radps: float = 0.0, turn_radps: float = 0.2) -> GyroUnit:
