@@ -67,6 +67,12 @@ def terrafusion(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[st
     return run
 
 
+@pytest.fixture(autouse=True)
+def own_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effects that a test registers are forgotten after it, so that no test depends on those before it."""
+    monkeypatch.setattr("terrafusion.twin.effects.catalogue._OWN", {})
+
+
 @pytest.fixture(scope="session")
 def husky_bag() -> Path:
     """The public Husky bag, where the environment names the folder of field logs."""

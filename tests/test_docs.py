@@ -12,7 +12,6 @@ import pytest
 from typer.testing import CliRunner
 
 from terrafusion.fusion.cli.main import app
-from terrafusion.twin.effects import catalogue
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -48,11 +47,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("terrafusion.fusion.reports.replay.write_report", lambda *_, **__: None)
     return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def no_effects_of_its_own_are_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(catalogue, "_OWN", {})
 
 
 def test_readme(folder: Path) -> None:

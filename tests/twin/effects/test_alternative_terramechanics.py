@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import (
     PLATE_M,
     hyperbolic_share,
@@ -26,12 +25,6 @@ from terrafusion.twin.simulate import simulate_run
 from tests.twin.effects.effect_cases import plant, samples, soil
 
 SHORT = dataclasses.replace(load_scenario("figure_eight"), duration_s=20.0)
-
-
-@pytest.fixture(autouse=True)
-def own_forms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What these tests register is forgotten after them."""
-    monkeypatch.setattr(catalogue, "_OWN", {})
 
 
 def derivatives(share: float, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:

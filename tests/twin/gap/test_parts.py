@@ -219,8 +219,7 @@ def test_null_probability_rises_with_the_p_value() -> None:
     assert null_probability(0.05) == pytest.approx(0.2893, abs=1e-3)  # Sellke et al. 2001, table 1
 
 
-def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(catalogue, "_OWN", {})
+def test_an_effect_of_ones_own_takes_part() -> None:
     form = Form(
         "trailer", "drag", one("N", 10.0, 0.0, 200.0),
         {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - e * q["u"]}},
@@ -233,8 +232,7 @@ def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> No
     assert own.columns("trailer") == (own.keys.index("trailer/drag"),)
 
 
-def test_other_terramechanics_are_no_candidate_unless_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(catalogue, "_OWN", {})
+def test_other_terramechanics_are_no_candidate_unless_asked_for() -> None:
     name = next(iter(second_terramechanics())).split("/")[0]
     assert name in catalogue.effect_names()
     assert Candidates.of().keys == CANDIDATES.keys

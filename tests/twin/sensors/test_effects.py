@@ -30,12 +30,6 @@ DOCS = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"
 SHORT = dataclasses.replace(load_scenario("figure_eight"), duration_s=20.0)
 
 
-@pytest.fixture
-def own_forms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forms registered by a test are forgotten after it."""
-    monkeypatch.setattr(catalogue, "_OWN", {})
-
-
 def same(a: Recording, b: Recording, *names: str) -> bool:
     """Whether the channels are equal bit for bit."""
     for name in names:
@@ -174,7 +168,7 @@ def test_words_of_the_command_line() -> None:
             effect_values(words)
 
 
-def test_an_own_effect_of_the_docs_takes_part_in_everything(own_forms) -> None:
+def test_an_own_effect_of_the_docs_takes_part_in_everything() -> None:
     """The example of docs/reference/effects.md, as it stands there."""
     block = next(b for b in re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S) if "register" in b)
     exec(block, {})
@@ -189,7 +183,7 @@ def test_an_own_effect_of_the_docs_takes_part_in_everything(own_forms) -> None:
         simulate(SHORT, effects={key: -1.0})
 
 
-def test_forms_that_cannot_work_are_refused(own_forms) -> None:
+def test_forms_that_cannot_work_are_refused() -> None:
     with pytest.raises(ConfigError, match="unknown stage 'tyre'"):
         Form("own", "a", one("", 1.0, 0.0, 1.0), {"tyre": lambda q, e: {}}, "")
     with pytest.raises(ConfigError, match="hold zero"):

@@ -39,10 +39,9 @@ def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -
         assert np.sqrt(np.mean(difference**2)) < 3e-3
 
 
-def test_an_effect_that_is_not_written_as_c_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_effect_that_is_not_written_as_c_has_one_thread() -> None:
     import casadi as ca
 
-    monkeypatch.setattr(catalogue, "_OWN", {})
     body = {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - ca.if_else(q["u"] > 0.5, e, 0.0)}}
     catalogue.register(Form("trailer", "brake", one("N", 10.0, 0.0, 200.0), body, "force e beyond 0.5 m/s"))
     given = runs(970, 1), runs(975, 1), load_vehicle("elevate"), None
