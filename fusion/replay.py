@@ -104,7 +104,82 @@ def replay(
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
     """
-    # What the estimator gets: robot, fixes, noise policy and complete samples.
+    drive = _prepare(recording, vehicle, mode, policy, outages, magnetometer, settings, grounds)
+    run = _run_estimator(drive, batch, progress, watch)
+    estimator = run.estimator
+
+    estimate = run.estimate((*drive.notes, *run.notes(), *drive.unused))
+    scores = drive.score(estimate, estimator)
+    rivals = drive.baselines(estimate, scores, estimator)
+
+    rig = drive.config.rig
+    found = run_checks(recording, rig) if findings is None else findings
+    delay_s = estimator.learned.uncorrected_delay_s()
+    verdict = judge(Run(recording, estimate, scores, rivals, drive.used, found, rig, delay_s))
+    return ReplayResult(
+        recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
+        drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
+        rivals, verdict, drive.assumed, estimator.learned.table(), estimator.weights.learned_grounds(),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """A recording as the estimator gets it, and what is held out for the scores.
+
+    `given` has complete samples only; `notes` and `unused` are reported of the inputs, before and
+    after the notes of the run.
+    """
+
+    recording: Recording
+    given: Recording
+    vehicle: VehicleParams
+    config: EstimatorConfig
+    used: Gnss | None
+    held_out: Gnss | None
+    outages: tuple[Outage, ...]
+    assumed: tuple[Assumption, ...]
+    notes: tuple[str, ...]
+    unused: tuple[str, ...]
+
+    def score(self, estimate: Estimate, estimator: Estimator) -> Scores:
+        """Errors against the truth or the fixes held out."""
+        return score(
+            estimate,
+            self.recording,
+            held_out=self.held_out,
+            outages=self.outages,
+            antenna_m=estimator.gnss.antenna_places,
+            aligned=estimator.gnss.local,
+        )
+
+    def baselines(self, estimate: Estimate, scores: Scores, estimator: Estimator) -> Baselines:
+        """What wheels and gyro, and the receiver, give alone."""
+        rig = self.config.rig
+        return baselines(
+            self.recording,
+            estimate,
+            scores,
+            self.used,
+            self.outages,
+            wheel_radius_m=rig.wheel_radius_m,
+            track_m=rig.track_m,
+            antenna_m=rig.sensors.gnss.antenna_m,
+            aligned=estimator.gnss.local,
+        )
+
+
+def _prepare(
+    recording: Recording,
+    vehicle: str | Path | VehicleParams | None,
+    mode: str,
+    policy: Path | Policy | None,
+    outages: Sequence[Outage],
+    magnetometer: bool,
+    settings: EstimatorOptions | None,
+    grounds: GroundMemory | None,
+) -> _Drive:
+    """Choose the robot and the noise, and split the fixes into those used and those held out."""
     params, vehicle_notes = choose_vehicle(recording, vehicle)
     used, held_out = split_fixes(recording, outages)
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
@@ -113,45 +188,13 @@ def replay(
     config = EstimatorConfig(
         params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {})
     )
-
-    # Feed it as live; for a batch, then smooth the whole run.
-    run = _run_estimator(config, given, used, batch, progress, watch)
-    estimator = run.estimator
-
-    # Score it.
-    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig), *run.notes())
+    assumed = assumptions(recording, vehicle or recording.vehicle, params, inputs, used)
+    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig))
+    unused: tuple[str, ...] = ()
     if recording.magnetometer is not None and not magnetometer:
-        notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
-    estimate = run.estimate(notes)
-    scores = score(
-        estimate,
-        recording,
-        held_out=held_out,
-        outages=outages,
-        antenna_m=estimator.gnss.antenna_places,
-        aligned=estimator.gnss.local,
-    )
-
-    # Compare it with what the sensors alone give, and judge it.
-    rivals = baselines(
-        recording,
-        estimate,
-        scores,
-        used,
-        outages,
-        wheel_radius_m=config.rig.wheel_radius_m,
-        track_m=config.rig.track_m,
-        antenna_m=config.rig.sensors.gnss.antenna_m,
-        aligned=estimator.gnss.local,
-    )
-    found = run_checks(recording, config.rig) if findings is None else findings
-    delay_s = estimator.learned.uncorrected_delay_s()
-    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig, delay_s))
-    return ReplayResult(
-        recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), run.seconds,
-        run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
-        assumptions(recording, vehicle or recording.vehicle, params, inputs, used),
-        estimator.learned.table(), estimator.weights.learned_grounds(),
+        unused = ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
+    return _Drive(
+        recording, given, params, config, used, held_out, tuple(outages), assumed, notes, unused
     )  # fmt: skip
 
 
@@ -177,14 +220,13 @@ class _FinishedRun:
 
 
 def _run_estimator(
-    config: EstimatorConfig,
-    given: Recording,
-    used: Gnss | None,
+    drive: _Drive,
     batch: bool,
     progress: Callable[[float], None] | None,
     watch: Callable[[Estimator], None] | None,
 ) -> _FinishedRun:
-    """Feed the samples `given` as live; for a batch, then smooth the whole run."""
+    """Feed the samples as live; for a batch, then smooth the whole run."""
+    config = drive.config
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
 
     def keyframe(state: State) -> None:
@@ -199,11 +241,11 @@ def _run_estimator(
         archive=archive,
     )
     started = time.perf_counter()
-    latencies_ms = feed(estimator, given, progress)
+    latencies_ms = feed(estimator, drive.given, progress)
     alignment_notes = history.align(estimator.gnss.alignment, batch)
     if archive is not None and history.states:
         history.smooth(archive, estimator.config, estimator.gnss.alignment is not None)
     seconds = time.perf_counter() - started
     if not history.states:
-        raise never_started(used)
+        raise never_started(drive.used)
     return _FinishedRun(estimator, history, alignment_notes, seconds, latencies_ms)

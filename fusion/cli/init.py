@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,7 @@ from terrafusion.fusion.cli.common import (
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.datasets.core.sensors import Rig
+    from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import FirstVehicle
 
 NumberOption = str | None
@@ -73,58 +75,89 @@ def init(
 
     Example: terrafusion init drive.mcap --topic imu=/front/imu --drive tracked --track 0.62
     """
-    from terrafusion.datasets.core.errors import ConfigError
-    from terrafusion.datasets.readers.formats import format_of
-    from terrafusion.datasets.readers.open import find_log
     from terrafusion.datasets.readers.ros.streams import decoded_once
     from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
     from terrafusion.fusion.cli.inspect_page import print_lines
-    from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import first_vehicle, generic_rig
 
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
-    texts = {
-        "drive": drive,
-        "wheel_radius_m": wheel_radius,
-        "track_m": track,
-        "wheelbase_m": wheelbase,
-        "antenna_m": antenna,
-        "imu_m": imu_position,
-        "mass_kg": mass,
-    }
-    given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
-    answers = Answers(vehicle_name or out.stem, **given)
+    answers = _answers(
+        out,
+        vehicle_name,
+        drive=drive,
+        wheel_radius_m=wheel_radius,
+        track_m=track,
+        wheelbase_m=wheelbase,
+        antenna_m=antenna,
+        imu_m=imu_position,
+        mass_kg=mass,
+    )
     reading(None, topic, stamps, columns, repair_clock)  # reports wrong usage before anything is read
-    held: list[tuple[Any, Recording]] = []
-    is_bag = format_of(find_log(log)[0]).name in ("ros1", "ros2")
-
-    def open_log(rig: Rig | None) -> Recording:
-        from terrafusion.datasets.readers import open_recording
-
-        receiver = rig.sensors.gnss if rig is not None else None
-        if held and held[-1][0] == receiver:
-            return held[-1][1]
-        entries = [f"{channel}={name}" for channel, name in topics.items()]
-        recording = open_recording(log, **reading(rig, entries, stamps, columns, repair_clock))
-        recording = clock_accepted(recording) if repair_clock else recording
-        if not is_bag:  # all that the vehicle changes in other logs is the sigma of fixes without one
-            held.append((receiver, recording))
-        return recording
-
+    first_log = _FirstLog(log, stamps, columns, repair_clock)
     with decoded_once():
-        topics = choose_sensors(log, parse_topics(topic))
-        first = open_log(generic_rig())
+        first_log.topics = choose_sensors(log, parse_topics(topic))
+        first = first_log.read(generic_rig())
         print_lines(contents_lines(first))
-        answers = ask(answers, topics)
+        answers = ask(answers, first_log.topics)
         with progress_bar("calibrating the sensors") as progress:
-            found = first_vehicle(open_log, first, answers, progress)
+            found = first_vehicle(first_log.read, first, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
     lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]
-    again = _options(topics, stamps, columns, repair_clock)
-    first_step, command = _next_commands(log, out, again, bool(found.repaired))
+    first_step, command = _next_commands(log, out, first_log.options(), bool(found.repaired))
     return Result([*lines, *first_step], command, short=f"written to {out}")
+
+
+def _answers(out: Path, vehicle_name: str | None, **texts: str | None) -> Answers:
+    """What the options say of the robot, by the names of the vehicle file."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.fusion.init.answers import Answers
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+    given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
+    return Answers(vehicle_name or out.stem, **given)
+
+
+@dataclass
+class _FirstLog:
+    """The log and how it is read, with the topics chosen so far."""
+
+    log: str
+    stamps: str
+    columns: Path | None
+    repair_clock: bool
+    topics: dict[str, str] = field(default_factory=dict)
+    held: tuple[Any, Recording] | None = None
+
+    def read(self, rig: Rig | None) -> Recording:
+        """The recording of a robot; another reading only where the robot can change it."""
+        from terrafusion.datasets.readers import open_recording
+
+        receiver = rig.sensors.gnss if rig is not None else None
+        if self.held is not None and self.held[0] == receiver:
+            return self.held[1]
+        entries = [f"{channel}={name}" for channel, name in self.topics.items()]
+        options = reading(rig, entries, self.stamps, self.columns, self.repair_clock)
+        recording = open_recording(self.log, **options)
+        recording = clock_accepted(recording) if self.repair_clock else recording
+        if not self._is_bag():  # all that the vehicle changes in other logs is the sigma of fixes without one
+            self.held = receiver, recording
+        return recording
+
+    def _is_bag(self) -> bool:
+        from terrafusion.datasets.readers.formats import format_of
+        from terrafusion.datasets.readers.open import find_log
+
+        return format_of(find_log(self.log)[0]).name in ("ros1", "ros2")
+
+    def options(self) -> str:
+        """The options by which another command reads the log alike; the file holds most topics itself."""
+        joints = {name: topic for name, topic in self.topics.items() if name.startswith("joint.")}
+        words = [f"--topic {shlex.quote(f'{name}={topic}')}" for name, topic in joints.items()]
+        words += [f"--stamps {self.stamps}"] if self.stamps != "header" else []
+        words += [f"--columns {shlex.quote(str(self.columns))}"] if self.columns is not None else []
+        words += ["--repair-clock"] if self.repair_clock else []
+        return "".join(f" {word}" for word in words)
 
 
 def _next_commands(log: str, out: Path, again: str, repaired: bool) -> tuple[list[str], str]:
@@ -154,15 +187,6 @@ def _write(out: Path, log: str, found: FirstVehicle) -> None:
 
     about = f"Vehicle file of the log '{found.recording.name}', written by: {command_line()}"
     write_draft(out, found.draft, about)
-
-
-def _options(topics: dict[str, str], stamps: str, columns: Path | None, repair_clock: bool) -> str:
-    """The options by which another command reads the log alike; the file holds most topics itself."""
-    words = [f"--topic {shlex.quote(f'{k}={v}')}" for k, v in topics.items() if k.startswith("joint.")]
-    words += [f"--stamps {stamps}"] if stamps != "header" else []
-    words += [f"--columns {shlex.quote(str(columns))}"] if columns is not None else []
-    words += ["--repair-clock"] if repair_clock else []
-    return "".join(f" {word}" for word in words)
 
 
 def _verdict(found: FirstVehicle, out: Path) -> list[str]:

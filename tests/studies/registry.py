@@ -403,18 +403,7 @@ STUDIES = (
     Study(
         "blind",
         "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
-        (
-            "terrafusion",
-            "gap-blind",
-            "--share",
-            "0.1",
-            "--seed",
-            "7",
-            "--jobs",
-            "2",
-            "--out",
-            OUT,
-        ),
+        ("terrafusion", "gap-blind", "--share", "0.1", "--seed", "7", "--jobs", "2", "--out", OUT),
         40,
         {
             "trials": r"(\d+ of \d+) trials",
