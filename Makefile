@@ -4,12 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml' -o -name '*.[ch]' -o -name '*.j2' -o -name '*.css') pyproject.toml README.md
 
-.PHONY: demo test lint docs help clean
+.PHONY: demo test lint docs dist help clean
 
 help:
 	@echo "make demo   drive a simulated robot over three grounds, localise it twice, write demo-out/report.html"
 	@echo "make test   the whole test suite (set TERRAFUSION_DATA to a folder of field logs to include those)"
-	@echo "make docs   the documentation as a site, build/site/index.html"
+	@echo "make docs   the documentation as a site, site/index.html"
+	@echo "make dist   wheel and source distribution (the site in it), dist/"
 	@echo "make lint   ruff, mypy and the import layers"
 
 demo: $(VENV)/installed
@@ -20,6 +21,9 @@ test: $(VENV)/installed-dev
 
 docs: $(VENV)/installed-dev
 	$(BIN)/python -m mkdocs build --strict --quiet
+
+dist: docs
+	$(BIN)/python -m build --outdir dist
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
@@ -40,4 +44,4 @@ $(VENV)/installed-dev: $(BIN)/python $(SOURCES)
 	@touch $@ $(VENV)/installed
 
 clean:
-	rm -rf $(VENV) build demo-out *.egg-info
+	rm -rf $(VENV) build dist site demo-out *.egg-info

@@ -5,8 +5,11 @@ from __future__ import annotations
 import html
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
+import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -102,3 +105,27 @@ def test_no_page_asks_anything_from_outside(site: Path) -> None:
         assert not re.search(r"(?:@import|url\()\s*[\"']?(?:https?:)?//", style.read_text("utf-8")), (
             style.name
         )
+
+
+def test_the_source_distribution_holds_the_site_and_makes_the_same_wheel(site: Path, tmp_path: Path) -> None:
+    """What `make dist` does, in a copy: the wheel made from the archive has every file of the packages."""
+    tree, out = tmp_path / "tree", tmp_path / "dist"
+    left_out = shutil.ignore_patterns(
+        ".*", "build", "dist", "demo-out", "studies-work", "__pycache__", "*.egg-info"
+    )
+    shutil.copytree(ROOT, tree, ignore=left_out)
+    shutil.copytree(site, tree / "site", dirs_exist_ok=True)
+    command = [sys.executable, "-m", "build", "--outdir", str(out), str(tree)]
+    built = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert built.returncode == 0, built.stdout[-2000:] + built.stderr[-2000:]
+    (archive,), (wheel,) = out.glob("*.tar.gz"), out.glob("*.whl")
+    with tarfile.open(archive) as opened:
+        held = {name.partition("/")[2] for name in opened.getnames()}
+    assert {"site/index.html", "site/reference/cli.html", "tests/conftest.py", "docs/README.md"} <= held
+    with zipfile.ZipFile(wheel) as opened_wheel:
+        installed = set(opened_wheel.namelist())
+    for top in ("datasets", "twin", "fusion"):
+        for path in (ROOT / top).rglob("*"):
+            if path.is_file() and path.suffix != ".pyc":
+                place = "terrafusion/" + path.relative_to(ROOT).as_posix().removeprefix("fusion/_root/")
+                assert place in installed, place

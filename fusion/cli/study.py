@@ -10,6 +10,13 @@ import typer
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import progress_bar, read_json
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.workers import (
+    AddressOption,
+    BackendOption,
+    JobsOption,
+    check_backend,
+    processes,
+)
 
 OUTPUT = Output(
     "Folder for the tables, metrics.json and report.html.",
@@ -25,9 +32,9 @@ def study(
     seeds: Annotated[
         int | None, typer.Option(help="Seeds a case (10; 2 when quick).", show_default=False)
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes on this machine; by default one a processor.")
-    ] = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "loky",
+    address: AddressOption = None,
     bags: Annotated[
         bool, typer.Option("--bags", help="Also write the three runs as ROS 2 bags (MCAP).")
     ] = False,
@@ -39,16 +46,15 @@ def study(
 
     Example: terrafusion study --out study-out --quick
     """
-    import joblib
-
     from terrafusion.fusion.reports.study import write_bags, write_plan, write_study
     from terrafusion.twin.study.study import StudyPlan, run_study
     from terrafusion.twin.study.text import study_lines
 
-    plan = StudyPlan(seeds=seeds, quick=quick, jobs=jobs or joblib.cpu_count())
+    check_backend(backend, address)
+    plan = StudyPlan(seeds=seeds, quick=quick, jobs=processes(jobs))
     write_plan(out, plan)
     with progress_bar("study") as progress:
-        found = run_study(plan, progress)
+        found = run_study(plan, progress, backend=backend, address=address)
     command = f"terrafusion study{' --quick' if quick else ''} --seeds {plan.seed_count()}"
     write_study(out, found, {"command": command})
     if bags:

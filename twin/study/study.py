@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.executors import open_workers
+from terrafusion.twin.executors import Workers, open_workers
 from terrafusion.twin.study.batch import BatchResult, grid, run_cell, slip_cells
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
 from terrafusion.twin.study.claims import ClaimResult, judge, load_claims
@@ -90,12 +90,17 @@ class Study:
         return next(fit for fit in self.noise if fit.rate_hz == STUDY_LIKE_HZ)
 
 
-def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
+def run_study(
+    plan: StudyPlan, progress: Progress | None = None, *, backend: str = "loky", address: str | None = None
+) -> Study:
     """Drive everything the plan asks for, measure, and judge.
 
+    Args:
+        backend: "loky" (this machine) or "dask", then with the `address` of its scheduler.
+
     Raises:
-        ConfigError: seeds or jobs out of range.
-        TerrafusionError: a worker process died.
+        ConfigError: seeds or jobs out of range, or an address missing or out of place.
+        TerrafusionError: workers died, or the cluster does not answer.
     """
     seeds, level = range(plan.seed_count()), StudyCase(FLAT_TERRAIN, 0.0, *[float("nan")] * 4)
     cells, steps = grid(plan.quick), slip_cells(plan.quick)
@@ -105,7 +110,8 @@ def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
         *((run_cell, (cell,)) for cell in (*cells, *steps)),
         *((drive_field, (seed,)) for seed in seeds),
     ]
-    done = iter(_run_all(work, plan.jobs, progress))
+    with open_workers(backend, plan.jobs, address) as workers:
+        done = iter(_run_all(work, workers, progress))
     runs = {case.terrain: tuple(next(done) for _ in seeds) for case in CASES}
     flat = {FLAT_TERRAIN: tuple(next(done) for _ in seeds)}
     uneven = {case.terrain: tuple(next(done) for _ in seeds) for case in CASES}
@@ -135,16 +141,15 @@ def _noisy(rate_hz: float, runs: Mapping[str, Sequence[CaseRun]]) -> dict[str, t
 
 
 def _run_all(
-    work: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]], jobs: int, progress: Progress | None
+    work: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]], workers: Workers, progress: Progress | None
 ) -> list[Any]:
-    """The results of all calls, in the order of `work` whatever the number of processes."""
+    """The results of all calls, in the order of `work` whoever computes them."""
     results: list[Any] = [None] * len(work)
     numbered = ((number, function, arguments) for number, (function, arguments) in enumerate(work))
-    with open_workers("loky", jobs) as workers:
-        for done, (number, result) in enumerate(workers.results(_numbered, numbered), 1):
-            results[number] = result
-            if progress is not None:
-                progress(done / len(work))
+    for done, (number, result) in enumerate(workers.results(_numbered, numbered), 1):
+        results[number] = result
+        if progress is not None:
+            progress(done / len(work))
     return results
 
 

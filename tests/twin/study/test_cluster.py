@@ -1,0 +1,38 @@
+"""The source study on a Dask cluster of two processes, one of which is killed in the middle."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from terrafusion.twin.study.study import StudyPlan, run_study
+from terrafusion.twin.study.text import study_lines
+
+pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
+
+from tests.dask_cluster import scheduler, wait_for_workers, worker
+
+PLAN = StudyPlan(seeds=1, quick=True)
+
+
+def test_a_worker_killed_in_the_middle_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]))
+    here = run_study(PLAN)
+    shares: list[float] = []
+    with scheduler(tmp_path) as address, worker(address) as mortal, worker(address):
+        wait_for_workers(address, 2)
+
+        def kill_one(share: float) -> None:
+            shares.append(share)
+            if len(shares) == 3:
+                mortal.send_signal(signal.SIGKILL)
+
+        there = run_study(PLAN, kill_one, backend="dask", address=address)
+    assert shares[-1] == 1.0
+    assert study_lines(there) == study_lines(here)
+    assert there.measured == here.measured
