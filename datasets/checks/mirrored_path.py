@@ -11,10 +11,11 @@ from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.motion import course_agreement, gyro_angle
 from terrafusion.datasets.checks.path import LONGEST_S, antenna, dead_reckoned, path_by
 from terrafusion.datasets.checks.yaw_agreement import agreements
-from terrafusion.datasets.core.arrays import Complex
+from terrafusion.datasets.core.arrays import Array, Complex
 
 LEAST_FIXES = 20
-CLEARER, LEAST_OFF_M, SCALES = 4.0, 1.0, (0.5, 1.5)
+"""Fixes a piece, at least; more are averaged to so many, for noise of single fixes hides both images."""
+CLEARER, LEAST_OFF_M, SCALES = 3.0, 1.0, (0.5, 1.5)
 """Ratio of what is left of the fixes about the path and about its image, and the least of the former, from
 which on the image is meant: a straight path and its image differ by nothing, noise and drift bring both near
 each other. The image must have about the scale of the path."""
@@ -44,7 +45,7 @@ def check_mirrored(context: CheckContext) -> Iterator[Finding]:
 def residuals_m(context: CheckContext) -> tuple[float, float] | None:
     """RMS distance of the fixes from the dead-reckoned path, and from its image; None where not comparable.
 
-    Both are turned, shifted and scaled onto the fixes every `LONGEST_S`.
+    Both are turned, shifted and scaled onto the fixes every `LONGEST_S`, after averages over equal times.
     """
     measured, reckoned = path_by(context.recording, "gnss"), dead_reckoned(context, antenna(context))
     if measured is None or reckoned is None:
@@ -61,12 +62,21 @@ def residuals_m(context: CheckContext) -> tuple[float, float] | None:
         rows = piece == k
         if rows.sum() < LEAST_FIXES:
             continue
-        own, image = _left(z[rows], fix[rows]), _left(z[rows].conj(), fix[rows])
+        path, place = _averaged(t_s[rows], z[rows], fix[rows])
+        own, image = _left(path, place), _left(path.conj(), place)
         if not SCALES[0] <= image[1] <= SCALES[1]:
             return None
         squares += [own[0], image[0]]
-        count += int(rows.sum())
+        count += len(place)
     return (float(np.sqrt(squares[0] / count)), float(np.sqrt(squares[1] / count))) if count else None
+
+
+def _averaged(t_s: Array, *places: Complex) -> list[Complex]:
+    """Means over `LEAST_FIXES` equal times, of those that hold fixes."""
+    at = np.minimum((t_s - t_s[0]) * LEAST_FIXES / max(float(np.ptp(t_s)), 1e-9), LEAST_FIXES - 1).astype(int)
+    count = np.bincount(at, minlength=LEAST_FIXES)
+    sums = (np.bincount(at, p.real).astype(complex) + 1j * np.bincount(at, p.imag) for p in places)
+    return [one[count > 0] / count[count > 0] for one in sums]
 
 
 def _left(path: Complex, fix: Complex) -> tuple[float, float]:

@@ -53,6 +53,12 @@ def test_swapped_axes_of_coarse_fixes_are_found_and_mended(coarse: Recording) ->
     np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
 
 
+def test_noise_of_single_fixes_does_not_hide_the_image(coarse: Recording) -> None:
+    noisy = with_fixes(coarse, 0.6)
+    assert "gnss-course" not in codes(noisy)
+    assert "gnss-course" in codes(swapped(noisy))
+
+
 def test_a_straight_path_or_wild_fixes_show_no_image(coarse: Recording) -> None:
     straight = Scenario("line", 27.0, drive=(DriveSegment(27.0, 0.8),), route=(RouteLeg("asphalt"),))
     assert "gnss-course" not in codes(swapped(with_fixes(simulate(straight, seed=2), 0.3)))
