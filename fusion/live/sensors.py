@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.conventions import BODY_AXES
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.ros.arriving import KINDS, ArrivingMessages, GatheredMessages, RawMessage
+from terrafusion.datasets.readers.ros.arriving import (
+    KINDS,
+    MOST_GATHERED,
+    ArrivingMessages,
+    GatheredMessages,
+    RawMessage,
+)
 from terrafusion.datasets.readers.ros.bag import chosen_topics, recording_of
+from terrafusion.datasets.readers.ros.raw import BagError
 from terrafusion.datasets.readers.ros.static_frames import StaticFrames
 from terrafusion.datasets.readers.ros.topics import BagTopic
 
@@ -74,7 +84,11 @@ def find_sensors(
     if turn is not None:
         request = _without_axes(request)
     # Stamps out of order are no reason to wait: only the kinds of sensors are taken from this recording.
-    recording = recording_of(gathered, dataclasses.replace(request, repair_clock=True))
+    repairing = dataclasses.replace(request, repair_clock=True)
+    try:
+        recording = recording_of(gathered, repairing)
+    except (DataError, BagError):
+        recording = recording_of(_usable(gathered, ArrivingMessages(request, dict(chosen))), repairing)
     overrides = recording.overrides
     if "imu" in mounted:
         overrides = dataclasses.replace(overrides, imu_m=mounted["imu"][0])
@@ -84,6 +98,22 @@ def find_sensors(
     arriving = ArrivingMessages(request, chosen, datum or recording.datum, _if_turned(turn))
     notes = [*(f"{kind}: {topic.name} ({topic.msgtype})" for kind, topic in chosen.items()), *notes]
     return Sensors(recording, arriving, [*notes, *recording.notes])
+
+
+def _usable(gathered: GatheredMessages, arriving: ArrivingMessages) -> GatheredMessages:
+    """The messages but those that `arriving` refuses, and those of the IMU that lack numbers others have."""
+    usable, lacking = GatheredMessages(), {}
+    for message in gathered.messages:
+        with contextlib.suppress(DataError, BagError):
+            samples = [sample for _, kind, sample in arriving.samples(message) if kind == "imu"]
+            usable.messages.append(message)
+            for sample in samples:
+                lacking[id(message)] = tuple(np.isnan([*sample.gyro_radps, *sample.accel_mps2]).tolist())
+    if lacking:
+        usual = Counter(lacking.values()).most_common(1)[0][0]
+        held = [message for message in usable.messages if lacking.get(id(message), usual) == usual]
+        usable.messages = deque(held, maxlen=MOST_GATHERED)
+    return usable
 
 
 def _frame(gathered: GatheredMessages, topic: BagTopic) -> str:

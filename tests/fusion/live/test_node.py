@@ -366,3 +366,19 @@ def test_two_imus_are_a_question_and_no_end(messages: list[BagMessage]) -> None:
     assert any("choose with --topic imu=" in line for line in run.said)
     chosen = Run(topics={"imu": "/imu/data"}).feed(both)
     assert chosen.history.states
+
+
+def test_a_sample_without_numbers_does_not_delay_the_start(messages: list[BagMessage]) -> None:
+    """One bad sample of the IMU each second from the first on: the others start the estimator."""
+    nan = np.full(3, np.nan).tobytes()
+    spoilt, seconds = [], set[int]()
+    for t, topic, msgtype, cdr in messages:
+        if topic == "/imu/data" and t // 10**9 not in seconds:
+            seconds.add(t // 10**9)
+            cdr = cdr[:-96] + nan + cdr[-72:]
+        spoilt.append((t, topic, msgtype, cdr))
+    run = Run().feed(spoilt)
+    assert run.node.estimator is not None
+    assert run.node.counts["refused"] == len(seconds)
+    assert any(line.startswith("refused: imu: a sample lacks numbers") for line in run.said)
+    assert run.history.states[0].t_ns - messages[0][0] < 4_000_000_000
