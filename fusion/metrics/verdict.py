@@ -65,9 +65,8 @@ REPORTED = (
 """Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
 the estimator estimates itself, such as small scale errors and the receiver's delay, or cost accuracy only. It
 does not estimate delays of IMU and wheels: an offset of their clocks counts, too."""
-DELAY_SIGMAS, DELAY_SHARE = 2.5, 5.0
-"""A delay of the fixes is likely from so many of its sigmas on, and matters where the robot moves by so many
-sigmas of the position in it."""
+DELAY_SIGMAS = 2.0
+"""A delay of the fixes is likely from so many of its sigmas on (95 %)."""
 
 
 @dataclass(frozen=True)
@@ -322,13 +321,15 @@ def _delayed(run: Run) -> Iterator[Reason]:
     if run.delay_s is None or path.covariance is None or len(path) < 2:
         return
     delay_s, sigma_s = run.delay_s
-    speed = path.path_length_m() / (int(path.t_ns[-1] - path.t_ns[0]) * 1e-9)
-    sigma_m = float(np.sqrt(np.median(path.covariance[:, :2, :2].trace(axis1=1, axis2=2) / 2.0)))
-    if abs(delay_s) > DELAY_SIGMAS * sigma_s and abs(delay_s) * speed > DELAY_SHARE * sigma_m:
+    step_m = np.linalg.norm(np.diff(path.position_m[:, :2], axis=0), axis=1)
+    shift_m = abs(delay_s) * step_m / (np.diff(path.t_ns) * 1e-9)
+    variance_m2 = path.covariance[1:, :2, :2].trace(axis1=1, axis2=2) / 2.0
+    beyond = shift_m**2 > FIVE_SIGMA * variance_m2
+    if abs(delay_s) > DELAY_SIGMAS * sigma_s and beyond.mean() > STRAY_SHARE:
         yield (
             DOUBTFUL,
             f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
-            f"{sigma_s:.2f} s), {abs(delay_s) * speed:.2f} m at the mean speed, which sigma does not "
+            f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, which sigma does not "
             "include; give the receiver's delay in the vehicle file, or drive longer",
         )
 

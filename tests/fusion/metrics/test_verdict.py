@@ -216,7 +216,13 @@ def test_a_gyro_at_the_end_of_its_range_is_not_good_even_where_nothing_else_show
 
 @pytest.mark.parametrize(
     ("delay_s", "value"),
-    [((0.3, 0.05), "doubtful"), ((-0.3, 0.05), "doubtful"), ((0.3, 0.15), "good"), ((0.01, 0.001), "good")],
+    [
+        ((0.3, 0.05), "doubtful"),
+        ((-0.3, 0.05), "doubtful"),
+        ((0.3, 0.14), "doubtful"),
+        ((0.3, 0.15), "good"),
+        ((0.01, 0.001), "good"),
+    ],
 )
 def test_a_likely_delay_beyond_the_sigma_of_the_position_is_not_good(drive, delay_s, value):
     d = drive(noise_m=0.01, sigma_m=0.03)
