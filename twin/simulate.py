@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.engine.integrate import compiled
@@ -18,8 +16,6 @@ from terrafusion.twin.run_recording import record, run_notes
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.scenario import Scenario
 from terrafusion.twin.sensors.noise import NoiseStreams
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,6 @@ Own lines in place of `scipy.stats.bootstrap`: its import is slow, and it refuse
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,17 +12,6 @@ from numpy.typing import NDArray
 def resampled_rows(rows: int, resamples: int, seed: int) -> NDArray[np.int64]:
     """Row numbers (resamples, rows), drawn with replacement; the same seed gives the same rows."""
     return np.random.default_rng(seed).integers(rows, size=(resamples, rows))
-
-
-def resampled_groups(group: NDArray[Any], resamples: int, seed: int) -> list[NDArray[np.int64]]:
-    """Row numbers of resamples of whole groups (F,): rows of one group are drawn together."""
-    rng = np.random.default_rng(seed)
-    names, index = np.unique(group, return_inverse=True)
-    members = [np.flatnonzero(index == k) for k in range(len(names))]
-    return [
-        np.concatenate([members[k] for k in rng.integers(len(names), size=len(names))])
-        for _ in range(resamples)
-    ]
 
 
 def percentile_interval(samples: NDArray[np.float64], tail_percent: float = 2.5) -> tuple[float, float]:

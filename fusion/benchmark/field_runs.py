@@ -57,18 +57,6 @@ class FieldRun:
     has_sides: bool
 
 
-def field_runs(name: str, recordings: Sequence[Recording]) -> list[FieldRun]:
-    """The runs of one file; consecutive windows are joined.
-
-    Raises:
-        DataError: the log has no wheels or no gyro, or does not say which vehicle it is.
-    """
-    chains = chains_of(recordings)
-    return [
-        field_run(f"{name}#{k}" if len(chains) > 1 else name, name, chain) for k, chain in enumerate(chains)
-    ]
-
-
 def chains_of(recordings: Sequence[Recording]) -> list[list[Recording]]:
     """Chains of consecutive recordings, in their order."""
     chains: list[list[Recording]] = []

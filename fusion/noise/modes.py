@@ -6,9 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from terrafusion.datasets.core.config import quantities, structure
+from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
@@ -79,22 +79,6 @@ class ModeTuning:
     inputs_sha256: str = ""
 
 
-SECTIONS: dict[str, type] = {
-    "fixed": NoiseTuning,
-    "adaptive": NoiseTuning,
-    "cauchy": RobustTuning,
-    "gnc": RobustTuning,
-    "sage_husa": InnovationTuning,
-    "variational": InnovationTuning,
-}
-
-
-def bounds(section: type, name: str) -> tuple[float, float]:
-    """Least and largest allowed value of a number of a section."""
-    quantity = quantities(section)[name]
-    return quantity.low, quantity.high
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModesFile(ModeTuning):
     """Keys of a tuning file; all of them, and all of each section, are needed."""
@@ -114,15 +98,3 @@ def load_modes(path: Path | None = None) -> ModeTuning:
             return load_modes(shipped)
     content = structure(ModesFile, read_yaml(path), file=path, complete=True)
     return ModeTuning(**{f.name: getattr(content, f.name) for f in dataclasses.fields(ModeTuning)})
-
-
-def write_modes(tuning: ModeTuning, path: Path, made_by: str) -> None:
-    """Write a tuning file: same tuning, same bytes."""
-    from ruamel.yaml import YAML
-
-    content: dict[str, Any] = {"schema": SCHEMA, "made_by": made_by, "inputs_sha256": tuning.inputs_sha256}
-    content |= {name: dataclasses.asdict(getattr(tuning, name)) for name in SECTIONS}
-    yaml = YAML()
-    yaml.default_flow_style = False
-    with path.open("w", encoding="utf-8") as out:
-        yaml.dump(content, out)

@@ -69,7 +69,7 @@ def build_metrics(
         latencies_ms: (K,) time that each update took.
         terrain: share of the time spent on each class (see `terrain_shares`).
         changes: how many times a weight changed.
-        rejected: measurements rejected by a gate, by sensor (see `rejected_counts`).
+        rejected: measurements rejected by a gate, by sensor.
         status: `value` and `message` (see `final_status`).
         notes: what was assumed; notes on the scoring are added.
         calibration: rows of `linear_states.calibration` where it was asked for, else of `learned_rows`.
@@ -130,16 +130,6 @@ def terrain_shares(estimate: Estimate) -> dict[str, float]:
     label = np.nan_to_num(estimate.terrain).argmax(axis=1)
     total = np.bincount(label, weights=seconds, minlength=len(estimate.classes)) / seconds.sum()
     return {name: float(share) for name, share in zip(estimate.classes, total, strict=True) if share > 0.0}
-
-
-def rejected_counts(estimate: Estimate) -> dict[str, int]:
-    """Measurements rejected by a gate, by sensor: `gnss` with velocities, `wheels` with side-slip."""
-    counts = {"gnss": 0, "wheels": 0}
-    for innovation in estimate.innovations:
-        if not innovation.accepted:
-            sensor = next((name for name in counts if innovation.sensor.startswith(name)), innovation.sensor)
-            counts[sensor] = counts.get(sensor, 0) + 1
-    return counts
 
 
 def final_status(estimate: Estimate) -> dict[str, str]:

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate
@@ -34,8 +34,6 @@ from terrafusion.fusion.reports.plots.ellipses import ellipse_rows, ellipses, re
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import ReplayResult
 
-TimesNs = NDArray[np.int64]
-Array = NDArray[np.float64]
 
 GNSS_COLOUR, REJECTED_COLOUR, BODY_COLOUR = "#9a9a9a", "#111111", "#0072b2"
 

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.training.softmax import SoftmaxModel
 from terrafusion.fusion.training.surface_features import HOP_S, WINDOW_S, Signals, surface_windows
-
-Array = NDArray[np.float64]
 
 PATCHES = 30
 PATCH_S = (10.0, 30.0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import sha256_of
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of
 from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
@@ -28,8 +29,6 @@ from terrafusion.fusion.training.surface_features import (
     signals_of,
     surface_windows,
 )
-
-Array = NDArray[np.float64]
 
 FOLDS = 5
 INNER_FOLDS = 4

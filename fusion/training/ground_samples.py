@@ -31,14 +31,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.training.simulated_runs import seconds, wheel_samples
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
-
-Array = NDArray[np.float64]
 
 SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
 GYRO_S, ACCEL_S = 5.0, 2.0

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.terrain.classifier import Mixture
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 60
 TOLERANCE = 1e-5

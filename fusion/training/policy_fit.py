@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.noise.policy import SCHEMA, Policy, SensorNoise, within_ranges
@@ -35,8 +35,6 @@ from terrafusion.fusion.training.ground_samples import (
     samples_of,
 )
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all
-
-Array = NDArray[np.float64]
 
 SCENARIOS = ("staircase", "figure_eight")
 """0.3 to 1.5 m/s straight ahead in steps, with stops; 0.8 m/s in circles to both sides."""

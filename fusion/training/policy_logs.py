@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 from terrafusion.datasets.core.recording import Recording
@@ -32,8 +33,6 @@ from terrafusion.fusion.training.ground_samples import (
     yaw_scales_of,
 )
 from terrafusion.fusion.training.policy_fit import LoggedSamples
-
-Array = NDArray[np.float64]
 
 MEAN_S = 6.0
 GAP_S = 1.0

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.scratch import scratch_folder
@@ -24,8 +25,6 @@ from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
-
-Array = NDArray[np.float64]
 
 GROUNDS = ("asphalt", "medium_sand", "loose_sand", "mud")
 UPDATE_S = 0.5

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.yaml_file import read_yaml
@@ -28,8 +29,6 @@ from terrafusion.fusion.training.surface_features import (
     WINDOW_S,
     SurfaceWindows,
 )
-
-Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.surface/2"
 UNKNOWN = "unknown"

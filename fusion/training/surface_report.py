@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.training.change_detection import MIN_RUN_S, changes_seen
 from terrafusion.fusion.training.cross_validation import (
@@ -27,8 +28,6 @@ from terrafusion.fusion.training.cross_validation import (
 )
 from terrafusion.fusion.training.softmax import SoftmaxModel, fit_softmax
 from terrafusion.fusion.training.surface_features import GROUPS, SURFACE_FEATURES
-
-Array = NDArray[np.float64]
 
 STEPS = 5 + len(GROUPS)
 """Number of calls of `tick` in `report_on`."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
@@ -27,7 +27,6 @@ from terrafusion.fusion.training.window_store import WindowStore
 from terrafusion.twin.executors import Workers, open_workers
 from terrafusion.twin.model.version import model_sha256, version
 
-Array = NDArray[np.float64]
 LabelledWindows = tuple[list[Window], str]
 
 SCENARIOS = ("staircase", "figure_eight")

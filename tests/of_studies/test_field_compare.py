@@ -14,7 +14,7 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, field_runs
+from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.twin_field import compare, summary
@@ -22,7 +22,7 @@ from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks, forks_of
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, Hold
 from tests.studies.twin_field.scores import METRICS, interval, medians, scores
 from tests.studies.twin_field.slip import MEASURED, slip_rows
-from tests.studies.twin_field.sources import read
+from tests.studies.twin_field.sources import field_runs, read
 from tests.studies.twin_field.splits import evenly, folds
 
 SAMPLES = N_PAST + N_FUTURE + 1

@@ -26,8 +26,9 @@ from terrafusion.twin.engine.compiler import find_compiler
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.plant import Plant, RouteTable
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
@@ -101,7 +102,7 @@ def single(backend: str = "auto", repeats: int = 7, seconds: float = RUN_S) -> T
 
 def batch(runs: int = BATCH_RUNS, seconds: float = BATCH_S, jobs: int = JOBS, repeats: int = 3) -> Took:
     """Many runs on all grounds, slopes up to 5 deg, each with its own command."""
-    rng, names = np.random.default_rng(0), soil_names()
+    rng, names = np.random.default_rng(0), known_names("soils")
     few = [plant(names[i % len(names)], rng.uniform(0.0, 0.09)) for i in range(min(runs, 64))]
     plants = [few[i % len(few)] for i in range(runs)]
     commands = np.array([inputs(seconds, phase) for phase in rng.uniform(0.0, 6.0, runs)])

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.config import quantities
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.twin_runs import (
     FAMILIES,
@@ -41,7 +42,7 @@ from terrafusion.fusion.benchmark.twin_runs import (
     simulate_case,
 )
 from terrafusion.fusion.metrics.scores import Outage
-from terrafusion.fusion.noise.modes import ModeTuning, bounds, load_modes, write_modes
+from terrafusion.fusion.noise.modes import SCHEMA, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, scattered_soil
@@ -205,7 +206,8 @@ def _line(tuning: ModeTuning, method: str, name: str, factor: float) -> Iterator
     """The tuning with one number moved by one step, by two, and so on, while it may have the value."""
     section = getattr(tuning, method)
     value = getattr(section, name)
-    low, high = LIMITS.get((method, name)) or bounds(type(section), name)
+    quantity = quantities(type(section))[name]
+    low, high = LIMITS.get((method, name)) or (quantity.low, quantity.high)
     for _ in range(MOST_STEPS):
         value = float(f"{value * factor:.4g}")
         if not low <= value <= high:
@@ -247,6 +249,19 @@ def main() -> None:
     made_by = "python -m tests.studies.mode_tuning"
     write_modes(dataclasses.replace(tuned, inputs_sha256=fingerprint()), out, made_by)
     print(f"written to {out}")
+
+
+def write_modes(tuning: ModeTuning, path: Path, made_by: str) -> None:
+    """Write a tuning file: same tuning, same bytes."""
+    from ruamel.yaml import YAML
+
+    content: dict[str, Any] = {"schema": SCHEMA, "made_by": made_by, "inputs_sha256": tuning.inputs_sha256}
+    sections = [field.name for field in dataclasses.fields(ModeTuning) if field.name != "inputs_sha256"]
+    content |= {name: dataclasses.asdict(getattr(tuning, name)) for name in sections}
+    yaml = YAML()
+    yaml.default_flow_style = False
+    with path.open("w", encoding="utf-8") as out:
+        yaml.dump(content, out)
 
 
 if __name__ == "__main__":

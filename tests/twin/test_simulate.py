@@ -11,10 +11,11 @@ from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX
-from terrafusion.twin.scenario.file import load_scenario, scenario_names
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import Interval
 from terrafusion.twin.simulate import simulate, simulate_run
 
@@ -59,7 +60,7 @@ def test_energy_a_metre_grows_with_slope_payload_and_slip() -> None:
     assert energy(slope_deg=5.0) < energy(slope_deg=5.0, terrain="loose_sand")
 
 
-@pytest.mark.parametrize("name", scenario_names())
+@pytest.mark.parametrize("name", known_names("scenarios"))
 def test_every_scenario_runs_and_is_not_immobilised(name) -> None:
     run = simulate_run(name)
     assert run.summary.immobilised_at_s is None
@@ -155,6 +156,6 @@ def test_wrong_requests_are_reported_in_one_line(kwargs, message) -> None:
 
 
 def test_every_soil_and_vehicle_file_bears_its_own_name() -> None:
-    assert all(load_soil(name).name == name for name in soil_names())
+    assert all(load_soil(name).name == name for name in known_names("soils"))
     assert all(load_vehicle(name).name == name for name in vehicle_names())
-    assert set(soil_names()) <= set(TERRAINS)
+    assert set(known_names("soils")) <= set(TERRAINS)

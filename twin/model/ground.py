@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.twin.model.plant import RouteTable, SoilField, smoothstep
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
-
-Array = NDArray[np.float64]
 
 CELLS_A_LENGTH = 5.0
 """Grid points in the shorter correlation length: bilinear values between them lose at most 2 % of sigma."""

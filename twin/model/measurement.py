@@ -13,13 +13,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.dynamics import ARGUMENTS, ModelGraph, graph, origin_velocity
 from terrafusion.twin.physics.layout import INDEX, INPUTS, MOUNTING, OUTPUTS, VEHICLE_PARAMETERS, WHEELS
-
-Array = NDArray[np.float64]
 
 _NAMES = [*ARGUMENTS, "mounting"]
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

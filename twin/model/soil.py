@@ -15,7 +15,7 @@ from typing import Annotated
 
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.quantity import Sourced
-from terrafusion.twin.model.library import known_names, read_named
+from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
 
 
@@ -122,11 +122,6 @@ class SoilParams:
     def __post_init__(self) -> None:
         if self.vibration.high_hz <= self.vibration.low_hz:
             raise ValueError("vibration.high_hz must be above vibration.low_hz")
-
-
-def soil_names() -> tuple[str, ...]:
-    """Names of the soils that come with the library."""
-    return known_names("soils")
 
 
 def load_soil(name_or_path: str | Path) -> SoilParams:

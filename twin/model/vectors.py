@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, with_payload
-
-Array = NDArray[np.float64]
 
 
 def vehicle_vector(

@@ -2,8 +2,8 @@
 
 Everything here is evaluated on the states a step begins with: the battery's
 voltage follows from the torques the motors have, and limits those they may be
-given next. So there is no algebraic loop. `motor_current`, `motor_voltage`,
-`gear_loss` and `winding_loss` work on CasADi expressions and numpy arrays alike.
+given next. So there is no algebraic loop. `motor_current` and `motor_voltage`
+work on CasADi expressions and numpy arrays alike.
 """
 
 from __future__ import annotations
@@ -63,17 +63,6 @@ def motor_voltage(p: Any, current_a: Any, speed_radps: Any) -> Any:
 def winding_ohm(p: Any) -> Any:
     """Resistance of a motor's winding, ohm: nominal voltage over stall current."""
     return p["supply_v"] * p["supply_v"] / (p["no_load_radps"] * p["stall_torque_nm"])
-
-
-def winding_loss(p: Any, current_a: Any) -> Any:
-    """Heat in a motor's winding, W."""
-    return winding_ohm(p) * current_a * current_a
-
-
-def gear_loss(p: Any, current_a: Any, torque_nm: Any, speed_radps: Any) -> Any:
-    """Heat of friction in motor and gearbox, W: the power of the motor's field less that at the wheel."""
-    back_emf = p["supply_v"] / p["no_load_radps"] * p["gear_ratio"] * speed_radps
-    return back_emf * current_a - torque_nm * speed_radps
 
 
 def drawn_power(p: Any, torque_nm: Any, speed_radps: Any) -> Any:

@@ -11,7 +11,7 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.config import OneOf, refuse, structure
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.twin.model.ground import SoilPatches, Variation
-from terrafusion.twin.model.library import known_names, read_named
+from terrafusion.twin.model.library import read_named
 from terrafusion.twin.scenario.scenario import (
     MAX_SLOPE_DEG,
     PLACE,
@@ -95,11 +95,6 @@ class ScenarioFile:
     def total_s(self) -> float:
         """Duration of the drive; 0 where nothing says it."""
         return self.duration_s or sum(segment.duration_s for segment in self.drive)
-
-
-def scenario_names() -> tuple[str, ...]:
-    """Names of the scenarios that come with the library."""
-    return known_names("scenarios")
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:

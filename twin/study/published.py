@@ -38,5 +38,3 @@ CASES = (
 
 FRICTION = {"mud": (0.1, 0.2), "loose_sand": (0.4, 0.6), "medium_sand": (0.8, 1.0)}
 """Tab. 3: range of the effective friction coefficient of each terrain."""
-
-FIELD_MEAN_MPS, FIELD_MAX_MPS = 0.9, 2.5  # fig. 14: ground speed of the drive on sand

@@ -24,7 +24,7 @@ import numpy as np
 from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Switch, Whole, shown
-from terrafusion.twin.model.library import known_names, read_named
+from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
@@ -132,11 +132,6 @@ class SweepFile:
     random: Annotated[int, Whole("", 1, 10**7)] | None = None
     random_seed: Annotated[int, _SEED] = 0
     sensors: Switch = False
-
-
-def sweep_names() -> tuple[str, ...]:
-    """Names of the sweeps that come with the library."""
-    return known_names("sweeps")
 
 
 def load_sweep(name_or_path: str | Path) -> Sweep:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES, regimes
@@ -17,7 +17,6 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 MOST_CAUSES = 8
 PLACE_S = 0.5

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.error_series import Errors
@@ -16,7 +16,6 @@ from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
-Array = NDArray[np.float64]
 _SIGMAS = (
     ("wheel_sigma_mps", "wheel speed, m/s", "wheels", "solid"),
     ("slip_sigma", "slip", "slip", "solid"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics import consistency
 from terrafusion.fusion.reports.plots import style
@@ -15,7 +16,6 @@ NORMAL_95 = 1.959963985
 SHOWN_SIGMAS = 4.5
 """Normalised innovations beyond this are drawn at the edge."""
 EXPECTED_LABEL = "95 % if consistent"
-Array = NDArray[np.float64]
 
 
 def plot_biases(sheet: Sheet, estimate: Estimate, start_ns: int) -> None:

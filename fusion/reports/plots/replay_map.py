@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -23,7 +24,6 @@ from terrafusion.fusion.reports.plots.ellipses import (
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
-Array = NDArray[np.float64]
 MOST = 2 * style.MAX_POINTS
 
 

@@ -14,15 +14,15 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:
     from bokeh.plotting import figure as Figure  # noqa: N812
 
-Array = NDArray[np.float64]
 EXACT_IN_FLOAT32 = 2.0e4
 """Numbers up to this size are sent in single precision: their steps are below 2 mm there."""
 _OWN_ID = re.compile(r'"id": "(p\d+)"')

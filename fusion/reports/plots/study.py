@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.study.batch import BatchResult
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 TIME, SPEED, ENERGY = "time, s", "speed, m/s", "energy, J/m"
 WHEELS, GNSS = style.SENSOR_COLOURS["wheels"], style.SENSOR_COLOURS["gnss"]
 GYRO, RAW = style.SENSOR_COLOURS["gyro"], "#b9d9cf"

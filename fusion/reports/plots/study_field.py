@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.study.field_drive import FieldDrive
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 TIME = "time, s"
 GAP_S = 1.0
 """No line is drawn over a longer time without fixes."""

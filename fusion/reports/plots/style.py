@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.metrics.scores import Outage
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 TERRAIN_COLOURS = {
     "asphalt": "#4d4d4d",
@@ -138,13 +138,6 @@ def line(ax: Axes, t_s: Array, values: Array, colour: str, label: str | None = N
     """A line, thinned to `MAX_POINTS`."""
     rows = thin(len(t_s))
     ax.plot(t_s[rows], values[rows], color=colour, label=label, **({"linewidth": 1.2} | options))
-
-
-def band(ax: Axes, t_s: Array, values: Array, sigma: Array, colour: str, **options: Any) -> None:
-    """`values` within two `sigma`, thinned like `line`."""
-    rows = thin(len(t_s))
-    low, high = (values + k * sigma for k in (-2.0, 2.0))
-    ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, linewidth=0, **options)
 
 
 def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
+
 Columns = Mapping[str, NDArray[Any]]
 """The table of a sweep by column, (N,) each; NaN where a number is null."""
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_groups, resampled_rows
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
+from tests.studies.twin_field.resampled_groups import resampled_groups
 
 
 def test_rows_are_drawn_with_replacement_and_repeatably() -> None:

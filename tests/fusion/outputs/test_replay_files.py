@@ -20,10 +20,10 @@ from terrafusion.fusion.outputs.replay_files import (
     MODES,
     build_metrics,
     final_status,
-    rejected_counts,
     terrain_shares,
     write_outputs,
 )
+from tests.fusion.rejected import rejected_counts
 
 SCHEMA = json.loads(
     (Path(__file__).parents[3] / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8")

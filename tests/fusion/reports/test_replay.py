@@ -21,7 +21,6 @@ from terrafusion.fusion.metrics.scores import Outage, score
 from terrafusion.fusion.outputs.replay_files import (
     build_metrics,
     final_status,
-    rejected_counts,
     terrain_shares,
 )
 from terrafusion.fusion.reports.plots import replay as plots
@@ -32,6 +31,7 @@ from terrafusion.fusion.reports.plots.sheet import Sheet, compact
 from terrafusion.fusion.reports.plots.style import colour_of, label_text, thin
 from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.fusion.reports.replay_text import ScoreRow, pick_pair, score_rows, summary_of_many
+from tests.fusion.rejected import rejected_counts
 
 CLASSES = ("asphalt", "loose_sand", "mud", "unknown")
 COLOURS = {"adaptive": "#0072b2", "fixed": "#d55e00", "a": "#0072b2"}

@@ -18,7 +18,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
-from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes, write_modes
+from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -27,7 +27,7 @@ from terrafusion.fusion.weighting.robust import LEAST_WEIGHT, cauchy_weight, set
 from terrafusion.fusion.weighting.weighting import InnovationTest
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from tests.studies.mode_tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
+from tests.studies.mode_tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune, write_modes
 
 METHODS = ("cauchy", "gnc", "sage_husa", "variational")
 

@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.model.soil import SoilParams, load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams
 from tests.studies.twin_field import kinematic
 from tests.studies.twin_field.fitting import cost
@@ -42,7 +43,7 @@ class Hold:
 
 def nominal_soil(ground: str) -> SoilParams:
     """The library's soil of that name, else its firm one."""
-    return load_soil(ground if ground in soil_names() else FIRM)
+    return load_soil(ground if ground in known_names("soils") else FIRM)
 
 
 def for_wheels(vehicle: VehicleParams, ground: str, forks: Forks) -> dict[str, Model]:

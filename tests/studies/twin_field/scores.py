@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_groups
+from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.fusion.benchmark.body_velocity import heading
 from terrafusion.fusion.benchmark.field_runs import DT_S
 from tests.studies.twin_field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
+from tests.studies.twin_field.resampled_groups import resampled_groups
 
 Array = NDArray[np.float64]
 

@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_groups
+from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
+from tests.studies.twin_field.resampled_groups import resampled_groups
 from tests.studies.twin_field.single_wheel_fit import (
     EXPONENT,
     FREE,

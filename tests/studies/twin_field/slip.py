@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import resampled_groups
 from terrafusion.fusion.benchmark.field_runs import DT_S
 from tests.studies.twin_field.compare import SAME, Result
 from tests.studies.twin_field.forks import N_PAST, Forks
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
+from tests.studies.twin_field.resampled_groups import resampled_groups
 from tests.studies.twin_field.scores import DRAWS, SEED, Interval, interval
 
 Array = NDArray[np.float64]

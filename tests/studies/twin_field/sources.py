@@ -13,7 +13,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.open import open_recordings
 from terrafusion.fusion.benchmark.field_logs import CUT, WHOLE
-from terrafusion.fusion.benchmark.field_runs import FieldRun, field_runs
+from terrafusion.fusion.benchmark.field_runs import FieldRun, chains_of, field_run
 
 SETS = ("norlab_drive", "umich_husky", "wvu_pathfinder")
 """Sets with a reference for the motion; of the others of the catalogue only the wheels are known."""
@@ -49,6 +49,18 @@ def read(data: Sequence[Path | str], progress: Callable[[str], None] = lambda _:
             continue
         drives.runs.setdefault(runs[0].vehicle.name, []).extend(runs)
     return drives
+
+
+def field_runs(name: str, recordings: Sequence[Recording]) -> list[FieldRun]:
+    """The runs of one file; consecutive windows are joined.
+
+    Raises:
+        DataError: the log has no wheels or no gyro, or does not say which vehicle it is.
+    """
+    chains = chains_of(recordings)
+    return [
+        field_run(f"{name}#{k}" if len(chains) > 1 else name, name, chain) for k, chain in enumerate(chains)
+    ]
 
 
 def _can_be_told(recording: Recording) -> bool:

@@ -11,7 +11,8 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine import codegen, compiler, integrate, native
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.model.dynamics import rhs
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX, INPUTS
@@ -136,7 +137,7 @@ def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp
     native.forget()
 
 
-@pytest.mark.parametrize("terrain", soil_names())
+@pytest.mark.parametrize("terrain", known_names("soils"))
 @pytest.mark.parametrize("vehicle", vehicle_names())
 def test_the_motor_lag_is_the_fastest_mode(terrain, vehicle) -> None:
     """What the step rests on: along a drive with turns and stops, no eigenvalue exceeds 1 / lag."""

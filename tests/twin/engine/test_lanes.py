@@ -13,8 +13,9 @@ from terrafusion.twin.engine import native
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES
@@ -26,7 +27,7 @@ needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
 
 def plants() -> list[Plant]:
     """Every soil and vehicle, a border, and a field."""
-    vehicles, soils = vehicle_names(), [soil_vector(load_soil(name)) for name in soil_names()]
+    vehicles, soils = vehicle_names(), [soil_vector(load_soil(name)) for name in known_names("soils")]
     some = []
     for k in range(max(len(vehicles), len(soils)) + 1):
         vehicle = vehicle_vector(load_vehicle(vehicles[k % len(vehicles)]), slope_rad=0.02 * k)

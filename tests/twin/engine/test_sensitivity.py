@@ -10,8 +10,9 @@ import pytest
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
@@ -19,7 +20,7 @@ from terrafusion.twin.scenario.commands import delayed_inputs
 
 DT_S = 0.01
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
-CASES = [((name,), False) for name in soil_names()]
+CASES = [((name,), False) for name in known_names("soils")]
 CASES += [(("asphalt", "loose_sand"), False), (("loose_sand", "mud"), True)]
 BACKENDS = ["vm", pytest.param("c", marks=needs_compiler)]
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.dynamics import wheel_loads
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
@@ -47,7 +48,7 @@ def test_no_slip_without_force(run, frictionless) -> None:
     assert np.abs(rim / x[INDEX["u"]] - 1.0).max() < 1e-6
 
 
-@pytest.mark.parametrize("terrain", soil_names())
+@pytest.mark.parametrize("terrain", known_names("soils"))
 def test_steady_traction_meets_the_resistance(run, terrain) -> None:
     """Constant speed on the flat: the motors' power goes into slip and resistance, never below them."""
     x = run(terrain, constant(0.8 / RADIUS_M, 0.8 / RADIUS_M, 8.0))
@@ -57,7 +58,7 @@ def test_steady_traction_meets_the_resistance(run, terrain) -> None:
 
 @QUICK
 @given(
-    terrain=st.sampled_from(soil_names()),
+    terrain=st.sampled_from(known_names("soils")),
     u=st.floats(-1.5, 1.5),
     v=st.floats(-0.5, 0.5),
     r=st.floats(-1.0, 1.0),
@@ -75,7 +76,7 @@ def test_energy_is_never_created(run, terrain, u, v, r, rims) -> None:
 
 
 @QUICK
-@given(terrain=st.sampled_from(soil_names()), left=st.floats(-8.0, 8.0), right=st.floats(-8.0, 8.0))
+@given(terrain=st.sampled_from(known_names("soils")), left=st.floats(-8.0, 8.0), right=st.floats(-8.0, 8.0))
 def test_driving_costs_at_least_the_energy_gained(run, terrain, left, right) -> None:
     x = run(terrain, constant(left, right, 3.0))
     work = x[:, INDEX["motor_work"]]
@@ -100,7 +101,7 @@ def test_parked_robot_does_not_creep(run, terrain) -> None:
     assert x[-1, INDEX["y"]] == 0.0
 
 
-@pytest.mark.parametrize("terrain", soil_names())
+@pytest.mark.parametrize("terrain", known_names("soils"))
 def test_mirrored_commands_give_the_mirrored_path(run, terrain) -> None:
     sides = constant(3.0, 6.0, 10.0)
     x, mirrored = run(terrain, sides), run(terrain, sides[:, ::-1])

@@ -11,9 +11,10 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Overrides
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
-from terrafusion.twin.scenario.file import load_scenario, scenario_names
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment
 from terrafusion.twin.simulate import simulate_run
 
@@ -204,4 +205,4 @@ def test_a_chirp_sweeps_from_its_first_to_its_last_frequency() -> None:
 def test_the_command_lists_every_scenario() -> None:
     from terrafusion.fusion.cli.simulate import simulate as command
 
-    assert all(name in command.__doc__ for name in scenario_names())
+    assert all(name in command.__doc__ for name in known_names("scenarios"))

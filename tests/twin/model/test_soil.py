@@ -15,7 +15,8 @@ import pytest
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.twin.model.soil import Validity, load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import Validity, load_soil
 from terrafusion.twin.model.soil_table import published_soils
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
@@ -57,10 +58,10 @@ def own(tmp_path: Path, name: str, old: str, new: str) -> Path:
 
 
 def test_all_grounds_have_a_soil() -> None:
-    assert set(soil_names()) == set(TERRAINS)
+    assert set(known_names("soils")) == set(TERRAINS)
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 def test_every_number_has_source_and_range(name) -> None:
     entries = dict(numbers(raw_soil(name)))
     assert len(entries) >= 24
@@ -72,7 +73,7 @@ def test_every_number_has_source_and_range(name) -> None:
     assert {"ground_pressure_pa", "wheel_diameter_m", "slip"} <= set(validity)
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 @pytest.mark.parametrize("vehicle", vehicle_names())
 def test_every_vehicle_may_drive_on_every_ground_with_all_its_payload(name, vehicle) -> None:
     robot = load_vehicle(vehicle)

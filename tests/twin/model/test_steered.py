@@ -12,7 +12,6 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
-from terrafusion.twin.analysis.summary import energy_of
 from terrafusion.twin.calibrate.inputs import twin_input
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_overrides
@@ -21,6 +20,7 @@ from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import open_loop, steering_angles
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate, simulate_run
+from tests.twin.energy_balance import energy_of
 
 STEERED = ("ackermann", "four_wheel_steer")
 FRONT = INPUTS.index("steer_front_rad")

@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from terrafusion.twin.analysis.summary import (
     MOTOR_STALLED,
     TRACTION_LOST,
-    Energy,
-    energy_of,
     slip_ratios,
     summarise,
 )
@@ -25,12 +23,13 @@ from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import INDEX, INPUTS, STATES, VEHICLE_PARAMETERS, state_slice
-from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
+from terrafusion.twin.physics.motors import battery, motor_current, motor_torque
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates, delayed_inputs
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
+from tests.twin.energy_balance import Energy, energy_of, gear_loss
 
 ELEVATE = load_vehicle("elevate")
 P = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(ELEVATE).tolist(), strict=True))

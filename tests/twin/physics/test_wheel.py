@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.library import known_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
 from terrafusion.twin.physics.terramechanics import WheelShape
@@ -21,7 +22,7 @@ SMOOTH = WheelShape(0.175, 0.145)
 SPIKED = WheelShape(0.175, 0.145, 0.02, 18.0)
 SPEEDS = st.floats(-2.0, 2.0)
 LOADS = st.floats(5.0, 500.0)
-SOILS = st.sampled_from(soil_names())
+SOILS = st.sampled_from(known_names("soils"))
 FEW = settings(max_examples=60, deadline=None)
 
 
@@ -36,7 +37,7 @@ def steady(
     return Contact(*(float(value) for value in steady_contact(on, load, rim, hub, shape)))
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 @pytest.mark.parametrize("speed", [-1.5, -0.1, 0.3, 2.0])
 def test_no_traction_without_slip(name, speed) -> None:
     wheel = steady(ground(name), speed, (speed, 0.0))
@@ -92,14 +93,14 @@ def test_the_closed_form_is_the_steady_state(name, rim, u, v) -> None:
     assert abs(wheel.brake_rate) < 1e-9
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 def test_traction_grows_with_slip(name) -> None:
     on = ground(name)
     pulls = [steady(on, 1.0, (1.0 - s, 0.0)).traction_x_n for s in np.linspace(0.0, 0.95, 20)]
     assert (np.diff(pulls) > 0.0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in soil_names() if name != "asphalt"])
+@pytest.mark.parametrize("name", [name for name in known_names("soils") if name != "asphalt"])
 def test_sinkage_grows_with_load_slip_and_skid_and_shrinks_with_width(name) -> None:
     on = ground(name)
     z = [steady(on, 1.0, (1.0, 0.0), load).sinkage_m for load in (20.0, 80.0, 200.0)]
@@ -194,7 +195,7 @@ def _graph() -> tuple[Any, Any]:
     return ca.vertcat(x, soil), ca.vertcat(*c)
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 @pytest.mark.parametrize("state", [np.zeros(7), np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])])
 def test_second_derivatives_are_finite_at_rest_and_at_zero_slip(name, state) -> None:
     inputs, outputs = _graph()

@@ -10,8 +10,9 @@ import pytest
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.sensor_realism import GnssRealism
-from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import state_slice
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
@@ -109,7 +110,7 @@ def test_scale_and_misalignment_are_found_by_regression() -> None:
     np.testing.assert_allclose(fitted, wanted, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("name", known_names("soils"))
 def test_vibration_rises_with_speed_to_the_level_of_the_soil(name) -> None:
     level = load_soil(name).vibration.accel_mps2_at_1mps * ELEVATE.realism.vibration_gain
     for speed in (0.4, 0.8):

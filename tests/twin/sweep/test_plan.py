@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.sweep.load import load_sweep, sweep_names
+from terrafusion.twin.sweep.load import load_sweep
 from terrafusion.twin.sweep.plan import Axis, Sweep, at_speed, top_speed_mps
 
 
@@ -26,7 +27,7 @@ def axes(folder: Path, text: str, more: str = "") -> Sweep:
     return written(folder, f"scenario: straight\n{more}\naxes: {text}\n")
 
 
-@pytest.mark.parametrize("name", sweep_names())
+@pytest.mark.parametrize("name", known_names("sweeps"))
 def test_built_in_sweeps_load_and_say_how_many_runs_they_make(name: str) -> None:
     sweep = load_sweep(name)
     assert f"{sweep.runs} runs of" in sweep.design()
