@@ -79,7 +79,7 @@ def test_effect_a_wider_track(references: list[Recording]) -> None:
     assert answer["verdict"] == "effect"
     assert answer["named"] == ["track_width"]
     assert not answer["gap"]["uncalibrated"]
-    assert answer["causes"][0]["parameters"]["track_width/scale"]["value"] == pytest.approx(0.1, abs=0.01)
+    assert answer["causes"][0]["parameters"]["track_width/scale"]["value"] == pytest.approx(0.1, abs=0.012)
     assert {c["effect"] for c in answer["causes"]} == set(Candidates.of().effects)
     assert answer["next_run"] is None
 

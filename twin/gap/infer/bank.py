@@ -1,16 +1,15 @@
 """Bank of nonlinear signatures: what each law does to the errors of the judged runs, at several sizes.
 
 A signature between two sizes is interpolated. Laws that act on the sensors alone and no delays are linear
-(their columns are their signatures); all others are simulated, along their one parameter, at sizes that grow
-by a constant factor up to the end of their range. A law of several parameters that vanishes to first order is
-simulated along the direction in which all are equal, in typical sizes.
+(their columns are their signatures). All others begin with their sensitivity, up to the ends of their range,
+and are simulated, along their one parameter, where a size is of interest. A law of several parameters that
+vanishes to first order is simulated along the direction in which all are equal, in typical sizes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,8 +21,6 @@ from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitene
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.delay import DELAYS
 
-GROWTH = 3.0
-"""Factor from one simulated size to the next."""
 INSENSITIVE = 10.0
 """A law is insensitive where its sensitivity, at the end of its range, makes a smaller square in all runs;
 32-bit rounding makes 3 at most (docs/how-to/gap.md)."""
@@ -65,19 +62,16 @@ class SignatureBank:
 
     @classmethod
     def of(cls, evidence: GapEvidence, simulate: bool = True) -> SignatureBank:
-        """All laws that are not linear: at one typical size by their sensitivity, which costs nothing, and
-        beyond by rollout, unless `simulate` is false."""
+        """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones by
+        rollout, unless `simulate` is false."""
         ladders, candidates, points = dict[Hypothesis, Ladder](), evidence.candidates, list[SimulatedSize]()
-        soils = [np.zeros(len(evidence.soil_limit))] * len(
-            evidence.runs
-        )  # a run's own holds a part of the effect
         columns = [run.by_parameter for run in evidence.runs]
         first: list[list[Array]] = [[] for _ in columns]
         for law in candidates.hypotheses:
             if not is_simulated(law, candidates):
                 continue
             low, high = candidates.bounds(law.columns)
-            near, far = [(0.0, -1)], list[float]()
+            steps, far = [(0.0, -1)], list[float]()
             square = sum(float(np.square(c[:, law.columns].sum(axis=1)).sum()) for c in columns)
             for end in (float(low.max()), float(high.min())):
                 if end == 0.0:
@@ -85,14 +79,12 @@ class SignatureBank:
                 if square * end**2 < INSENSITIVE:
                     far += [share * end for share in THRESHOLDS]
                     continue
-                step = math.copysign(min(1.0, abs(end)), end)
-                near.append((step, len(first[0])))
+                steps.append((end, len(first[0])))
                 for mine, c in zip(first, columns, strict=True):
-                    mine.append(step * c[:, law.columns].sum(axis=1))
-                far += [end / GROWTH] * (abs(end) > GROWTH**1.5) + [end] * (abs(end) > 1.0)
-            near.sort()
-            ladders[law] = Ladder(law, np.array([x for x, _ in near]), tuple(c for _, c in near))
-            points += [SimulatedSize(law, x, soils) for x in far]
+                    mine.append(end * c[:, law.columns].sum(axis=1))
+            steps.sort()
+            ladders[law] = Ladder(law, np.array([x for x, _ in steps]), tuple(c for _, c in steps))
+            points += [SimulatedSize(law, x, model_soil(evidence)) for x in far]
         empty = [np.zeros((len(run.time_s), 0)) for run in evidence.runs]
         bank = cls(ladders, [np.column_stack([e, *mine]) for e, mine in zip(empty, first, strict=True)])
         return bank.with_sizes(evidence, points) if simulate else bank
@@ -115,10 +107,11 @@ class SignatureBank:
         runs = range(len(evidence.runs))
         effects = [effects_at(evidence, p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
         tried = [RunWithEffects(r, e, p.soils[r]) for p, e in zip(points, effects, strict=True) for r in runs]
-        tried += [RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs]
+        place = {(r, p.soils[r].tobytes()): RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs}
         # Unclipped: a large effect is no outlier.
-        errors = whitened_errors(evidence, tried, clip=False)
-        errors, plain = errors[: len(tried) // 2], errors[len(tried) // 2 :]
+        errors = whitened_errors(evidence, [*tried, *place.values()], clip=False)
+        on_soil = dict(zip(place, errors[len(tried) :], strict=True))
+        plain = [on_soil[r, p.soils[r].tobytes()] for p in points for r in runs]
         new: list[list[Array]] = [[] for _ in runs]
         found: dict[Hypothesis, list[tuple[float, int]]] = {
             law: list(zip(old.at.tolist(), old.column, strict=True)) for law, old in self.ladders.items()
@@ -141,6 +134,11 @@ class SignatureBank:
             ladders[law] = Ladder(law, np.array([x for x, _ in steps]), tuple(c for _, c in steps))
         more = [np.column_stack([old, *some]) for old, some in zip(self.signatures, new, strict=True)]
         return dataclasses.replace(self, ladders=ladders, signatures=more)
+
+
+def model_soil(evidence: GapEvidence) -> list[Array]:
+    """The model's own soil for each run: a run's own holds a part of the effect."""
+    return [np.zeros(len(evidence.soil_limit))] * len(evidence.runs)
 
 
 def is_simulated(law: Hypothesis, candidates: Candidates) -> bool:

@@ -16,12 +16,13 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
-from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets
+from terrafusion.twin.gap.infer.other_drives import FEWEST, RobotOffsets
 from terrafusion.twin.gap.infer.predictive import metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import score
 
+GROUPS = 4  # most groups of references
 RIDGE = 1e-3  # information on a coefficient beforehand
 
 
@@ -45,6 +46,7 @@ class ReferenceGains:
         cls,
         evidence: GapEvidence,
         sigma: Array,
+        robot: RobotOffsets,
         weight: Array,
         laws: Laws,
         alone: Mapping[int, Fitted],
@@ -54,16 +56,18 @@ class ReferenceGains:
 
         Args:
             sigma: (T,) 1 sigma of the states.
+            robot: offsets, learned from all references.
             weight: (C,) of each channel, as for `metric`.
         """
-        references = evidence.references
-        size = min(len(evidence.runs), len(references) // 2)
-        if len(references) - size < FEWEST or not size:
+        count = len(evidence.references)
+        size = min(len(evidence.runs), count // 2)
+        if count - size < FEWEST or not size:
             return cls((), {}, 0.0)
+        references = evidence.references[: GROUPS * size]
         there = dataclasses.replace(
-            evidence, runs=references, residuals=evidence.reference_residuals, references=[]
+            evidence, runs=references, residuals=evidence.reference_residuals[: GROUPS * size], references=[]
         )
-        soils = [residuals.soil for residuals in evidence.reference_residuals]
+        soils = [residuals.soil for residuals in there.residuals]
         at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in linear}
         empty = SignatureBank({}, [np.zeros((len(run.time_s), 0)) for run in references])
         bank = empty.with_sizes(there, [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x])
@@ -76,12 +80,11 @@ class ReferenceGains:
         for i, fit in alone.items():
             used[i][column[i]] = fit.values[0] if i in linear else 1.0
         products, extra = products_with_discrepancy(references, evidence.model, bank, used)
-        scores, looks = [score(run, sigma) for run in references], list[CloseLook]()
-        effects = len(evidence.candidates.keys)
+        scores, looks = [score(run, sigma) for run in evidence.references], list[CloseLook]()
         for first in range(0, len(references) - size + 1, size):
             group = range(first, first + size)
-            robot = learn_offsets([s for i, s in enumerate(scores) if i not in group], effects)
-            group_metric = metric([products[i] for i in group], weight, sigma, robot)
+            others = robot.of([s for i, s in enumerate(scores) if i not in group])
+            group_metric = metric([products[i] for i in group], weight, sigma, others)
             looks.append(CloseLook(group_metric, laws, (), extra))
         return cls(tuple(looks), column, len(evidence.runs) / size)
 

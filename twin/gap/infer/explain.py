@@ -1,7 +1,8 @@
 """Explains a gap by the effects that caused it, or by a cause outside the catalogue.
 
-A first look ranks all laws, alone and beside each of the best few. The twin is then simulated at the best
-sizes of the promising ones, which a close look compares alone, in pairs and triples; what they explain on
+A first look ranks all laws, alone and beside each of the best few, to first order; a second one those that
+looked promising, simulated at their best sizes. The twin is simulated again at the best sizes of the
+promising ones of these, which a close look compares alone, in pairs and triples; what they explain on
 references is subtracted. Where even the best of them leaves more in a channel than the references do, the
 noise of that channel is taken to be larger.
 """
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
+from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.chance import ReferenceGains
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
@@ -31,6 +32,8 @@ Sets = tuple[str, ...]  # names of effects that act together, sorted
 
 FIRST, BESIDE, TRIED = 12, 5, 4
 """Laws that get a close look: the best alone, and the best beside each of the best few."""
+SECOND, GROWTH = 18, 3.0
+"""Best laws alone that get a second look, and the factor from a best size to the next one simulated there."""
 ROUNDS = 2  # in which the twin is simulated at the best sizes; in which channels are weighted
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
 LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
@@ -103,16 +106,31 @@ class _Explainer:
         left = {*self.without}
         return [i for i, h in enumerate(laws.names) if not left & {h.effect, f"{h.effect}/{h.form}"}]
 
-    def promising(self, m: Metric, laws: Laws, alone: Mapping[int, Fitted]) -> dict[int, list[Array]]:
-        """Laws worth a close look, with the sizes at which to simulate them."""
+    def promising(
+        self, m: Metric, laws: Laws, alone: Mapping[int, Fitted], most: int = FIRST
+    ) -> dict[int, list[Array]]:
+        """Laws worth a closer look, with the sizes at which to simulate them."""
         order = sorted(alone, key=lambda i: -alone[i].evidence)
-        sizes = {i: [alone[i].values[0]] for i in order[:FIRST]}
+        sizes = {i: [alone[i].values[0]] for i in order[:most]}
         for i in order[:TRIED]:
             gains, values, _ = laws.best(m, m.K[:, m.error] - m.K @ alone[i].used)
             others = [k for k in order if laws.names[k].effect != laws.names[i].effect]
             for k in sorted(others, key=lambda k: -gains[k])[:BESIDE]:
                 sizes.setdefault(k, []).append(values[k])
         return sizes
+
+    def first_sizes(self, bank: SignatureBank, sizes: Mapping[int, list[Array]], laws: Laws) -> SignatureBank:
+        """The bank simulated at some sizes, and at larger ones: the sensitivity of a law that saturates makes
+        them too small."""
+        points, soils = list[SimulatedSize](), model_soil(self.evidence)
+        for i, some in sizes.items():
+            law = laws.names[i]
+            if law in bank.ladders:
+                at = bank.ladders[law].at
+                new = {float(v[0]) for v in some}
+                new.add(float(np.clip(GROWTH * some[0][0], at[0], at[-1])))
+                points += [SimulatedSize(law, x, soils) for x in sorted(new) if abs(x) > LEAST_SIZE]
+        return bank.with_sizes(self.evidence, points)
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
@@ -162,6 +180,9 @@ def explain(
     if not close:
         one: dict[tuple[int, ...], Fitted] = {(i,): fit for i, fit in alone.items()}
         return _by_effect(one, alone, laws, own.outside(m), {}, lambda fit: [fit.values] * len(evidence.runs))
+    bank = own.first_sizes(bank, own.promising(m, laws, alone, SECOND), laws)
+    runs, m, laws = own.look(bank)
+    alone = {i: laws.fit(m, (i,)) for i in own.allowed(laws)}
     sizes = own.promising(m, laws, alone)
     bank = bank.only(laws.names[i] for i in sizes)
     runs, m, laws = own.look(bank)
@@ -183,7 +204,9 @@ def explain(
         before, weight = weight, own.weights(runs, found[top], weight)
         if np.allclose(before, weight, rtol=0.1):
             break
-    chance = ReferenceGains.of(evidence, sigma, before, laws, {i: found[i,] for i in sizes}, laws.planes)
+    chance = ReferenceGains.of(
+        evidence, sigma, robot, before, laws, {i: found[i,] for i in sizes}, laws.planes
+    )
     found = {
         some: dataclasses.replace(fit, evidence=fit.evidence - chance.most(some))
         for some, fit in found.items()

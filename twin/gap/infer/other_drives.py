@@ -10,6 +10,7 @@ the judged drive have the same distribution, and the p-value is the rank among t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -44,13 +45,20 @@ class RobotOffsets:
     Attributes:
         mean, covariance: (P,) and (P, P) of the columns that all its runs share.
         scatter: (P,) variance from run to run.
+        prior: (P,) variance of the columns before the references.
         references: number of them.
     """
 
     mean: Array
     covariance: Array
     scatter: Array
+    prior: Array
     references: int
+
+    def of(self, references: Sequence[Score]) -> RobotOffsets:
+        """What some references know, with the same scatter and prior."""
+        mean, covariance, _ = _posterior(references, self.scatter, self.prior)
+        return dataclasses.replace(self, mean=mean, covariance=covariance, references=len(references))
 
 
 def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
@@ -58,24 +66,32 @@ def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
     P, count = len(references[0].b), len(references)
     first = np.where(np.arange(P) < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER) ** 2
     group = np.maximum(np.arange(P) - candidates, -1) // len(BASIS)
-    scatter, offset = first, np.ones(P)
+    scatter, prior = first, np.ones(P)
+    mean, covariance = np.zeros(P), np.eye(P)
     for _ in range(EM_STEPS):
-        within = [np.linalg.inv(r.A + np.diag(1.0 / scatter)) for r in references]
-        moved = [H @ r.A for r, H in zip(references, within, strict=True)]
-        known = [r.A - r.A @ m for r, m in zip(references, moved, strict=True)]
-        gain = [r.b - r.A @ (H @ r.b) for r, H in zip(references, within, strict=True)]
-        covariance: Array = np.asarray(np.linalg.inv(np.diag(1.0 / offset) + sum(known)))
-        mean = covariance @ np.sum(gain, axis=0)
-        square = np.zeros(P)
-        for r, H, m in zip(references, within, moved, strict=True):
-            own = H @ (r.b - r.A @ mean)
-            square += own**2 + np.diag(H) + np.einsum("ij,ij->i", m @ covariance, m)
+        mean, covariance, square = _posterior(references, scatter, prior)
         scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + count)
         own = mean**2 + np.diag(covariance)
+        prior = prior.copy()
         for k in np.unique(group):
             mine = group == k
-            offset[mine] = max((PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + mine.sum()), 1.0)
-    return RobotOffsets(mean, covariance, scatter, count)
+            prior[mine] = max((PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + mine.sum()), 1.0)
+    return RobotOffsets(mean, covariance, scatter, prior, count)
+
+
+def _posterior(references: Sequence[Score], scatter: Array, prior: Array) -> tuple[Array, Array, Array]:
+    """Mean (P,) and covariance (P, P) of the robot's offsets, and the sum (P,) of the expected squares of the
+    runs' own."""
+    within = [np.linalg.inv(r.A + np.diag(1.0 / scatter)) for r in references]
+    moved = [H @ r.A for r, H in zip(references, within, strict=True)]
+    known = np.diag(1.0 / prior) + sum(r.A - r.A @ m for r, m in zip(references, moved, strict=True))
+    gain = np.sum([r.b - m.T @ r.b for r, m in zip(references, moved, strict=True)], axis=0)
+    covariance: Array = np.asarray(np.linalg.inv(known))
+    mean, square = covariance @ gain, np.zeros(len(scatter))
+    for r, H, m in zip(references, within, moved, strict=True):
+        own = H @ (r.b - r.A @ mean)
+        square += own**2 + np.diag(H) + np.einsum("ij,ij->i", m @ covariance, m)
+    return mean, covariance, square
 
 
 @dataclass(frozen=True)

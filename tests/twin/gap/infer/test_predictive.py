@@ -11,7 +11,7 @@ from terrafusion.twin.gap.infer.predictive import Products, energies, metric
 T, P, Q, N = 2, 3, 2, (40, 25)
 SIGMA = np.array([0.5, 2.0])
 ROBOT = RobotOffsets(
-    np.array([0.3, -0.2, 0.1]), np.diag([1.0, 0.3, 0.1]) + 0.02, np.array([0.02, 0.1, 0.3]), 9
+    np.array([0.3, -0.2, 0.1]), np.diag([1.0, 0.3, 0.1]) + 0.02, np.array([0.02, 0.1, 0.3]), np.ones(3), 9
 )
 
 
