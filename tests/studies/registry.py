@@ -288,6 +288,26 @@ STUDIES = (
         "opponents.png",
     ),
     Study(
+        "unseen_robots",
+        "Are errors in outages smaller than a plain EKF's on robots that no part of the library made?",
+        _module("unseen_robots.study", "--out", OUT),
+        15,
+        {
+            f"{mode}_{seconds}_s": rf"{mode} over EKF, {seconds} s: ([\d.]+ \[[\d.]+, [\d.]+\])"
+            for mode in ("fixed", "adaptive")
+            for seconds in (10, 30)
+        }
+        | {
+            f"{mode}_{seconds}_s_lost": rf"{mode} over EKF, {seconds} s: .* lost (\d+ of \d+)"
+            for mode in ("fixed", "adaptive")
+            for seconds in (10, 30)
+        }
+        | {
+            f"inside_{seconds}_s": rf"adaptive over EKF, {seconds} s: .* ellipses (\d+ %)"
+            for seconds in (10, 30)
+        },
+    ),
+    Study(
         "coarse_slides",
         "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
         _module("coarse_slides"),

@@ -1,0 +1,94 @@
+"""The robots of the study `unseen_robots` drive as bodies must, and their sensors say what happened."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
+from tests.studies.unseen_robots.draw import DRIVES, KINDS, Robot, draw
+from tests.studies.unseen_robots.machine import LOOP_S, STANDING_S, Driven, drive
+from tests.studies.unseen_robots.sensors import recording_of
+from tests.studies.unseen_robots.study import EKF, MODES, Result, table
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
+
+
+def plain(kind: str, **changes: object) -> Robot:
+    """A robot of a kind of drive on level ground with grip, without errors, for 20 s."""
+    ideal: dict[str, object] = {
+        "drive": kind, "duration_s": 20.0, "bumps_m": 0.0, "slick_share": 0.0, "friction": 0.9,
+        "imu_yaw_rad": 0.0, "imu_tilt_rad": (0.0, 0.0), "imu_m": (0.0, 0.0, 0.0), "receiver": KINDS["rtk"],
+        "imu_hz": 100.0, "wheels_hz": 20.0, "wheel_error": 1.0, "fix_delay_s": 0.0,
+    }  # fmt: skip
+    return dataclasses.replace(draw(0), **{**ideal, **changes})
+
+
+@pytest.fixture(scope="module", params=DRIVES)
+def driven(request: pytest.FixtureRequest) -> tuple[Robot, Driven]:
+    robot = plain(request.param)
+    return robot, drive(robot)
+
+
+def test_the_same_seed_is_the_same_log() -> None:
+    robot = plain("skid_steer", duration_s=6.0, bumps_m=0.1, slick_share=0.4)
+    one, other = (recording_of(robot, drive(robot)) for _ in range(2))
+    assert one.imu is not None
+    assert other.imu is not None
+    assert np.array_equal(one.imu.gyro_radps, other.imu.gyro_radps)
+    assert draw(7) == draw(7) != draw(8)
+
+
+def test_at_rest_the_specific_force_is_gravity_upwards(driven: tuple[Robot, Driven]) -> None:
+    rest = driven[1].force_mps2[round(1.5 / LOOP_S) : round(STANDING_S / LOOP_S)].mean(axis=0)
+    assert rest == pytest.approx([0.0, 0.0, 9.81], abs=0.1)
+
+
+def test_the_gyro_is_the_rate_of_the_heading(driven: tuple[Robot, Driven]) -> None:
+    _, moved = driven
+    turned = np.unwrap(yaw_of(moved.quaternion))
+    assert abs(turned[-1] - turned[0]) > 0.5
+    assert np.sum(moved.gyro_radps[:, 2]) * LOOP_S == pytest.approx(turned[-1] - turned[0], abs=0.02)
+
+
+def test_with_grip_the_wheels_roll_the_path_of_the_body(driven: tuple[Robot, Driven]) -> None:
+    robot, moved = driven
+    lever = quaternion_to_matrix(moved.quaternion) @ np.array(robot.antenna_m)
+    path_m = np.hypot(*np.diff((moved.antenna_m - lever)[:, :2], axis=0).T).sum()
+    used = moved.wheels_rad[:, :2] if robot.drive == "differential" else moved.wheels_rad
+    rolled_m = np.abs(np.diff(used.mean(axis=1))).sum() * robot.radius_m
+    assert path_m > 5.0
+    assert rolled_m == pytest.approx(path_m, rel=0.06)
+
+
+def test_slick_ground_lets_the_wheels_slip() -> None:
+    grip, slick = (plain("skid_steer", friction=mu, duration_s=12.0) for mu in (0.9, 0.02))
+    ahead = [np.hypot(*np.diff(drive(r).antenna_m[:, :2], axis=0).T).sum() for r in (grip, slick)]
+    assert ahead[1] < 0.8 * ahead[0]
+
+
+def test_a_turned_imu_and_late_fixes_are_in_the_log() -> None:
+    robot = plain("ackermann", duration_s=8.0)
+    changed = dataclasses.replace(robot, imu_yaw_rad=0.5 * np.pi, fix_delay_s=1.0)
+    log, other = recording_of(robot, drive(robot)), recording_of(changed, drive(changed))
+    for one in (log, other):
+        assert one.imu is not None
+        assert one.gnss is not None
+        assert one.steering is not None
+    forward, sideways = log.imu.accel_mps2[:, 0], -other.imu.accel_mps2[:, 1]
+    assert np.std(forward) > 0.1
+    assert np.corrcoef(forward, sideways)[0, 1] > 0.95
+    assert other.gnss.t_ns[0] - log.gnss.t_ns[0] == 1_000_000_000
+
+
+def test_the_table_compares_with_the_filter() -> None:
+    results = [
+        Result("one", 10.0, name, 4, error, 1.0, inside)
+        for name, error, inside in ((EKF, 2.0, None), (MODES[0], 1.0, 0.9), (MODES[1], 3.0, 1.0))
+    ]
+    lines = table(results)
+    assert "fixed over EKF, 10 s: 0.50, lost 0 of 1, worst 0.50, inside 95 % ellipses 90 %" in lines
+    assert "adaptive over EKF, 10 s: 1.50, lost 1 of 1, worst 1.50, inside 95 % ellipses 100 %" in lines
