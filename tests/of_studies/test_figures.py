@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.studies.figures import QUOTED, differences, documents, rewritten
-from tests.studies.registry import STUDIES, Study
+from tests.studies.registry import STUDIES
+from tests.studies.study import Study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "tests" / "studies" / "results"

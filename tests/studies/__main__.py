@@ -22,7 +22,8 @@ import time
 from pathlib import Path
 
 from tests.studies.figures import differences, documents, rewritten
-from tests.studies.registry import DATA, OUT, STUDIES, Study
+from tests.studies.registry import STUDIES
+from tests.studies.study import DATA, OUT, Study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"

@@ -5,44 +5,7 @@ A study is a command. What it prints is its table; figures are read from it by p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-OUT = "{out}"
-"""Stands for the study's own folder, where it may keep parts of a long run."""
-DATA = "{data}"
-"""Stands for the folder of the public field logs (TERRAFUSION_DATA)."""
-
-
-@dataclass(frozen=True)
-class Study:
-    """One experiment.
-
-    Attributes:
-        question: what it answers, in a sentence.
-        command: arguments of `python`; a word that is `terrafusion` stands for the command line.
-        minutes: on two idle cores, about.
-        figures: name -> regular expression with one group; it is searched in what the command prints, line
-            by line from its beginning.
-        picture: file that the command leaves in its folder, if it draws one.
-    """
-
-    name: str
-    question: str
-    command: tuple[str, ...]
-    minutes: float
-    figures: dict[str, str] = field(default_factory=dict)
-    picture: str = ""
-
-    def needs_logs(self) -> bool:
-        """Whether it reads public field logs."""
-        return DATA in self.command or self.name in READS_LOGS
-
-
-READS_LOGS = (
-    "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix", "coarse_slides",
-)  # fmt: skip
-
+from tests.studies.study import DATA, OUT, Study, module
 
 BLIND_FIGURES = {
     "alarms": "false alarms, same drives", "alarms_other": "false alarms, other drives",
@@ -62,15 +25,11 @@ BLIND_FIGURES = {
 """Rows of the headline of `gap-blind`, by the name under which the page quotes them."""
 
 
-def _module(name: str, *arguments: str) -> tuple[str, ...]:
-    return ("-m", f"tests.studies.{name}", *arguments)
-
-
 STUDIES = (
     Study(
         "good_logs",
         "Do the log checks offer repairs for logs in which nothing is wrong?",
-        _module("good_logs"),
+        module("good_logs"),
         5,
         {
             "field_logs_changed": r"field logs \d+, of which a repair would change (\d+)",
@@ -80,7 +39,7 @@ STUDIES = (
     Study(
         "first_hour",
         "How long is each step of the first hour, does it work after `pip install .`, and how large is it?",
-        _module("first_hour"),
+        module("first_hour"),
         6,
         {
             **{
@@ -94,7 +53,7 @@ STUDIES = (
     Study(
         "ice_picture",
         "What does a real robot on ice do without GNSS, with fixed and with adaptive weights?",
-        _module("ice_picture", "--out", OUT),
+        module("ice_picture", "--out", OUT),
         4,
         {
             "drives": r"median of (\d+)",
@@ -107,7 +66,7 @@ STUDIES = (
     Study(
         "fuzz",
         "Does any input of readers, YAML, live API or command line end in a crash or a hang?",
-        _module(
+        module(
             "fuzz", "--readers", "4000", "--yaml", "2000", "--live", "2000", "--cli", "2000", "--out", OUT
         ),
         40,
@@ -116,7 +75,7 @@ STUDIES = (
     Study(
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
-        _module("fault_matrix.matrix", "--cells", "1000", "--seconds", "7200", "--out", OUT),
+        module("fault_matrix.matrix", "--cells", "1000", "--seconds", "7200", "--out", OUT),
         35,
         {
             "cells": r"cells (\d+)",
@@ -127,7 +86,7 @@ STUDIES = (
     Study(
         "kills",
         "Does a command that is killed, or a machine in trouble, leave half a result that passes for whole?",
-        _module("kills", "--out", OUT),
+        module("kills", "--out", OUT),
         40,
         {
             **{name: rf"{name} (\d+)$" for name in ("kills", "defects", "troubles")},
@@ -137,7 +96,7 @@ STUDIES = (
     Study(
         "soak",
         "Do memory, computing time and snapshots stay bounded over hours of live data?",
-        _module("soak", "--hours", "3"),
+        module("soak", "--hours", "3"),
         12,
         {
             f"{key}_{what}": rf"{name}: .*{pattern}"
@@ -154,7 +113,7 @@ STUDIES = (
     Study(
         "demo_seeds",
         "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",
-        _module("demo_seeds", "--seeds", "10"),
+        module("demo_seeds", "--seeds", "10"),
         12,
         {
             f"{drive}_{mode}_{what}": rf"{drive} +{mode}" + r" +[\d.]+" * i + r" +([\d.]+)"
@@ -170,7 +129,7 @@ STUDIES = (
     Study(
         "gap_other_drives",
         "Does the diagnosis hold on drives that its references did not make?",
-        _module("gap_other_drives"),
+        module("gap_other_drives"),
         6,
         {
             "alarms": r"false alarms (\d+ of \d+)",
@@ -181,14 +140,14 @@ STUDIES = (
     Study(
         "engine_accuracy",
         "How accurate is the twin's integrator at its own step?",
-        _module("engine_accuracy"),
+        module("engine_accuracy"),
         1,
         {"parked_creep_mud_mmps": r"parked on .*mud ([\d.]+)"},
     ),
     Study(
         "engine_speed",
         "How fast is the twin, beside other ways to integrate the same drive?",
-        _module("engine_speed"),
+        module("engine_speed"),
         3,
         {
             "run_300_s": r"one run of 300 s +([\d.]+) s",
@@ -198,20 +157,20 @@ STUDIES = (
     Study(
         "estimator_speed",
         "How long does the estimator compute, live and in batch, beside GTSAM's own optimisers?",
-        _module("speed.speed"),
+        module("speed.speed"),
         3,
     ),
     Study(
         "coverage",
         "Do two sigma of `calibrate` hold the true number?",
-        _module("coverage"),
+        module("coverage"),
         15,
         {"within_2_sigma_percent": r"all +\d+ +([\d.]+) %"},
     ),
     Study(
         "single_wheel",
         "Does the wheel model predict forces on a measured wheel that it was not fitted to?",
-        _module("twin_field.single_wheel", f"{DATA}/cmu_single_wheel/all_smooth_data.mat", "--out", OUT),
+        module("twin_field.single_wheel", f"{DATA}/cmu_single_wheel/all_smooth_data.mat", "--out", OUT),
         1,
         {
             "along": r"halves +fitted +R2 ([\d.]+)",
@@ -224,13 +183,13 @@ STUDIES = (
     Study(
         "twin_field",
         "Does the twin predict measured drives better than kinematic models?",
-        _module("twin_field.compare_drives", DATA, "--out", OUT),
+        module("twin_field.compare_drives", DATA, "--out", OUT),
         20,
     ),
     Study(
         "survey",
         "Do the public recordings hold what their publishers say of them?",
-        _module("survey.survey"),
+        module("survey.survey"),
         3,
     ),
     Study(
@@ -247,7 +206,7 @@ STUDIES = (
     Study(
         "slip",
         "How far off is the estimated slip, and how late is immobilisation seen?",
-        _module("slip_trials"),
+        module("slip_trials"),
         30,
         {
             f"{ground}_{what}": rf" *{ground} \d+ deg:" + (r" [\d.]+," if i else "") + r" ([\d.]+)"
@@ -258,26 +217,26 @@ STUDIES = (
     Study(
         "calibration_states",
         "Does the estimator find wrong numbers of the vehicle file while it drives?",
-        _module("calibration_trials"),
+        module("calibration_trials"),
         20,
     ),
     Study(
         "twin_consistency",
         "Are NEES and NIS in their bands on every ground of the twin?",
-        _module("twin_consistency"),
+        module("twin_consistency"),
         15,
     ),
     Study(
         "field_table",
         "How do the modes compare on every field log, with fixes and in outages?",
-        _module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
+        module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
         240,
         picture="field_table.png",
     ),
     Study(
         "opponents",
         "Are errors in outages smaller than those of an EKF, a GTSAM smoother and an INS, tuned alike?",
-        _module("opponents.table", "--out", OUT, "--jobs", "2"),
+        module("opponents.table", "--out", OUT, "--jobs", "2"),
         240,
         {
             f"{mode}_{what}_{seconds}_s": rf"{mode}, {known}, {seconds} s: ([\d.]+)"
@@ -290,7 +249,7 @@ STUDIES = (
     Study(
         "unseen_robots",
         "Are errors in outages smaller than a plain EKF's on robots that no part of the library made?",
-        _module("unseen_robots.study", "--out", OUT),
+        module("unseen_robots.study", "--out", OUT),
         15,
         {
             f"{mode}_{seconds}_s": rf"{mode} over EKF, {seconds} s: ([\d.]+ \[[\d.]+, [\d.]+\])"
@@ -310,7 +269,7 @@ STUDIES = (
     Study(
         "coarse_slides",
         "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
-        _module("coarse_slides"),
+        module("coarse_slides"),
         5,
         {
             "judged": r"judged: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
@@ -320,13 +279,13 @@ STUDIES = (
     Study(
         "outage_terms",
         "Which term of dead reckoning are errors after 10 s without fixes made of?",
-        _module("opponents.decompose"),
+        module("opponents.decompose"),
         5,
     ),
     Study(
         "grounds",
         "What does adaptive mode gain in outages on logs of one robot, and does memory know its grounds?",
-        _module("grounds"),
+        module("grounds"),
         8,
         {
             f"{group}_adaptive": rf"{group}, adaptive over fixed: ([\d.]+) "
@@ -340,7 +299,7 @@ STUDIES = (
     Study(
         "ground_changes",
         "How soon is a change of ground noticed, and named, by a classifier of the robot's own grounds?",
-        _module("ground_changes"),
+        module("ground_changes"),
         3,
         {
             "macro_f1": r"macro-F1 ([\d.]+)",
@@ -354,7 +313,7 @@ STUDIES = (
     Study(
         "slip_model",
         "Can wheels and IMU alone predict slip on a robot, soil or data set that nothing was fitted to?",
-        _module("slip_model.study"),
+        module("slip_model.study"),
         5,
         {
             "drives": r"(\d+) drives of the twin",
@@ -380,7 +339,7 @@ STUDIES = (
     Study(
         "known_changes",
         "What do known changes in real logs cost an estimator that is not told, and do ellipses hold?",
-        _module("known_changes.table", "--out", OUT, "--jobs", "2"),
+        module("known_changes.table", "--out", OUT, "--jobs", "2"),
         240,
         {"ratio": r"all changes, not told: ([\d.]+)"},
         "known_changes.png",
@@ -405,19 +364,19 @@ STUDIES = (
     Study(
         "effect_sweep",
         "Which effects does the diagnosis see in the twin's own runs, and at what size?",
-        _module("effect_sweep"),
+        module("effect_sweep"),
         20,
     ),
     Study(
         "fault_injection",
         "Does the diagnosis name known changes that are put into real logs?",
-        _module("fault_injection.table", "--out", OUT),
+        module("fault_injection.table", "--out", OUT),
         60,
     ),
     Study(
         "effective_track",
         "Which track do wheels and gyro of a skid-steered robot imply on each ground?",
-        _module("effective_track", f"{DATA}/husky_parkinglot/test1.bag", "--vehicle", "husky"),
+        module("effective_track", f"{DATA}/husky_parkinglot/test1.bag", "--vehicle", "husky"),
         1,
     ),
     Study(
@@ -441,7 +400,7 @@ STUDIES = (
     Study(
         "blind_plant",
         "How far do plant and twin lie apart without noise or effects?",
-        _module("blind.plant_against_twin"),
+        module("blind.plant_against_twin"),
         1,
     ),
     Study(
