@@ -6,19 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies import kills
-from tests.studies.kills import (
-    BAD,
-    TROUBLES,
-    half_files,
-    killed,
-    prepared,
-    reference_run,
-    troubled,
-    two_at_once,
-)
+from tests.studies.kills.commands import COMMANDS, prepared
+from tests.studies.kills.kills import BAD, killed, reference_run
+from tests.studies.kills.leftovers import half_files
+from tests.studies.kills.troubles import TROUBLES, troubled, two_at_once
 
-WORDS = kills.COMMANDS["simulate"]
+WORDS = COMMANDS["simulate"]
 
 
 @pytest.fixture(scope="module")

@@ -86,7 +86,7 @@ STUDIES = (
     Study(
         "kills",
         "Does a command that is killed, or a machine in trouble, leave half a result that passes for whole?",
-        module("kills", "--out", OUT),
+        module("kills.kills", "--out", OUT),
         40,
         {
             **{name: rf"{name} (\d+)$" for name in ("kills", "defects", "troubles")},

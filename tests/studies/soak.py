@@ -134,8 +134,12 @@ class Soak:
             yield f"| {at_s / 3600.0:.2f} | {self.used_mb[i]:.1f} | {p99:.2f} | {self.dump_kb[i]:.0f} |"
 
 
-def soak(seconds: float, calibrate: bool, scenario: str = SCENARIO) -> Soak:
-    """Feed a live estimator for so long; `calibrate`: calibration states instead of self-calibration."""
+def soak(seconds: float, calibrate: bool, scenario: str = SCENARIO, longest_s: float = float("inf")) -> Soak:
+    """Feed a live estimator for so long, and for `longest_s` of real time at most.
+
+    `calibrate`: calibration states instead of self-calibration.
+    """
+    until = time.monotonic() + longest_s
     recording = simulate(scenario, seed=0)
     vehicle = load_vehicle("elevate")
     estimator = Estimator(
@@ -160,7 +164,7 @@ def soak(seconds: float, calibrate: bool, scenario: str = SCENARIO) -> Soak:
         found.used_mb.append(resident_mb())
         found.dump_kb.append(len(estimator.dump()) * 1e-3)
         print(f"{found.end_s[-1] / 3600.0:.2f} h: {found.used_mb[-1]:.1f} MB", file=sys.stderr, flush=True)
-        if found.end_s[-1] >= seconds:
+        if found.end_s[-1] >= seconds or time.monotonic() > until:
             break
     if not found.cpu_ms:
         raise DataError("the estimator never started")
@@ -171,10 +175,13 @@ def main() -> None:
     """Soak both kinds of calibration, each in a process of its own, and print their figures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--hours", type=float, default=3.0)
-    seconds = 3600.0 * parser.parse_args().hours
+    parser.add_argument("--seconds", type=float, default=7200.0, help="stop after so long, of real time")
+    given = parser.parse_args()
     for name, calibrate, share in (("self-calibration", False, 1.0), ("calibration states", True, 1 / 3)):
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            found = pool.apply(soak, (share * seconds, calibrate))
+            found = pool.apply(
+                soak, (share * 3600.0 * given.hours, calibrate, SCENARIO, share * given.seconds)
+            )
         print("\n".join(found.lines(name)), end="\n\n", flush=True)
 
 

@@ -16,7 +16,7 @@ from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.simulate import OUTPUT
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
-from tests.studies.kills import watched
+from tests.studies.kills.child import watched
 
 
 @pytest.fixture(scope="module")
