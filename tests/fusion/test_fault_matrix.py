@@ -30,6 +30,10 @@ def test_what_broke_the_numbers_is_refused(number: int) -> None:
     assert tried(cell)["outcome"] == "refused"
 
 
+def test_fixes_a_tenth_of_a_second_late_do_not_pass_as_good() -> None:
+    assert tried(Cell(562, "steered", "adaptive", True, ("lag",)))["verdict"] == "doubtful"
+
+
 def test_a_fault_changes_the_log_alone_that_it_is_given() -> None:
     log = clean_log(TWIN[0])
     for number in range(len(FAULTS)):

@@ -94,6 +94,20 @@ STUDIES = (
         },
     ),
     Study(
+        "mutation",
+        "Do the tests notice when a number or an operator of the core is changed?",
+        module("mutation", "--mutants", "12", "--out", OUT),
+        20,
+        {"mutants": r"mutants (\d+),", "noticed": r"mutants \d+, noticed (\d+)"},
+    ),
+    Study(
+        "branch_coverage",
+        "Which share of the lines and branches of the three packages do the tests run?",
+        module("branch_coverage", "--jobs", "2", "--out", OUT),
+        30,
+        {package: rf"{package}: ([\d.]+ %)" for package in ("datasets", "twin", "fusion")},
+    ),
+    Study(
         "soak",
         "Do memory, computing time and snapshots stay bounded over hours of live data?",
         module("soak", "--hours", "3"),
