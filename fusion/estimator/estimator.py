@@ -73,8 +73,9 @@ LONGEST_STEP_S = 1.0
 SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
-SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
-"""Detection latency of a change of ground (docs/explanation/terrain.md); smaller shifts are ignored."""
+SEEN_LATE_NS, SWITCHED = 2_000_000_000, 0.1
+"""A change of ground is detected after at most so long (docs/explanation/terrain.md: the 95 % of delays);
+smaller shifts are ignored."""
 KEPT_NS = 2_000_000_000
 """Samples are kept for so long after their keyframe."""
 UNKNOWN = np.full(3, np.nan)

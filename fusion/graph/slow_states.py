@@ -24,6 +24,8 @@ docs/explanation/monitor.md."""
 SLIP_RENEWAL = 1.1
 """Where the wheels change their speed by a share x, `SLIP_RENEWAL x^2` of the slip is new, as traction
 changes with speed (tuned)."""
+MOST_SWITCH = 0.98
+"""A change that is certain leaves this share of the old slip to be told: it may have been anywhen."""
 GROUND_STATES = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
 """What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
@@ -112,17 +114,19 @@ def inflate_slip_covariance(
     drift_time_s: float,
     switch: float,
 ) -> None:
-    """Restart the share `switch` of the slip at the keyframe of `t_ns`, or the oldest that still can.
+    """Restart the share `switch` of the slip, spread evenly over the keyframes since `t_ns` that are held.
 
     A change of ground is detected late; until then the measurements were explained by a speed that fits
-    the old slip.
+    the old slip. Spread out, the IMU tells when the speed changed.
     """
     k = chain.at_or_after(t_ns)
     k = chain.first + 1 if k is None else max(k, chain.first + 1)
-    if k <= chain.last:
+    passed = range(k, chain.last + 1)
+    share = 1.0 - (1.0 - min(switch, MOST_SWITCH)) ** (1.0 / max(len(passed), 1))
+    for k in passed:
         node = chain.nodes[k - chain.first]
         up = node.point.pose.rotation().matrix()[2]
-        anew = step(dt_s, noise, up, drift_sigma_m, drift_time_s, switch, node.wheels)
+        anew = step(dt_s, noise, up, drift_sigma_m, drift_time_s, share, node.wheels)
         chain.revise(k, anew if node.markov is None else node.markov.inflated(anew, GROUND_STATES))
 
 

@@ -17,6 +17,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.core.arrays import Array
+
 from terrafusion.datasets.core.config import quantities, structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity, Word
@@ -61,7 +63,7 @@ class SensorNoise:
 _FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
 _SLIP_MEAN, _SLIP_SIGMA = _FIELDS.index("slip_mean"), _FIELDS.index("slip_sigma")
 _YAW_MEAN, _YAW_SIGMA = _FIELDS.index("yaw_scale_mean"), _FIELDS.index("yaw_scale_sigma")
-_SLIP_PER_GRADE = _FIELDS.index("slip_per_grade")
+_SLIP_PER_GRADE, _SLIP_TIME = _FIELDS.index("slip_per_grade"), _FIELDS.index("slip_time_s")
 _AVERAGED = np.array(
     [name in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean") for name in _FIELDS]
 )
@@ -98,19 +100,31 @@ class Policy:
     def _table(self) -> NDArray[np.float64]:
         return np.array([dataclasses.astuple(row) for row in self.classes.values()])
 
-    def blend(self, probabilities: ArrayLike, grade: float = 0.0) -> SensorNoise:
+    def slips(self) -> tuple[Array, Array, Array, Array]:
+        """Mean, 1 sigma, slope over the grade and correlation time (s) of the slip, (k,) each."""
+        mean, sigma, slope, time_s = self._table[:, [_SLIP_MEAN, _SLIP_SIGMA, _SLIP_PER_GRADE, _SLIP_TIME]].T
+        return mean, sigma, slope, time_s
+
+    def blend(
+        self, probabilities: ArrayLike, grade: float = 0.0, slips: tuple[Array, Array] | None = None
+    ) -> SensorNoise:
         """The moment-matched noise for class probabilities (k,) that sum to one, at a grade.
+
+        `slips`: mean and 1 sigma (k,) of the slip of the classes, where not the policy's.
 
         Slip and yaw scale have the mean and the variance of the mixture (law of total variance: mean of
         the variances plus variance of the means); the other errors have zero mean in every class, so their
         variances average.
         """
-        p = np.asarray(probabilities, dtype=float)
-        mean = p @ self._table
-        variance = p @ self._table**2
-        slips = self._table[:, _SLIP_MEAN] + grade * self._table[:, _SLIP_PER_GRADE]
-        variance[_SLIP_SIGMA] += p @ (slips - p @ slips) ** 2
-        scales = self._table[:, _YAW_MEAN]
+        p, table = np.asarray(probabilities, dtype=float), self._table
+        if slips is not None:
+            table = table.copy()
+            table[:, _SLIP_MEAN], table[:, _SLIP_SIGMA] = slips
+        mean = p @ table
+        variance = p @ table**2
+        expected = table[:, _SLIP_MEAN] + grade * table[:, _SLIP_PER_GRADE]
+        variance[_SLIP_SIGMA] += p @ (expected - p @ expected) ** 2
+        scales = table[:, _YAW_MEAN]
         variance[_YAW_SIGMA] += p @ (scales - p @ scales) ** 2
         return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
 

@@ -20,7 +20,8 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
-from terrafusion.fusion.terrain.features import slip_without_prior
+from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, slip_without_prior
+from terrafusion.fusion.weighting.driven_slip import DrivenSlip
 from terrafusion.fusion.weighting.innovation import InnovationWeighting
 from terrafusion.fusion.weighting.robust import RobustWeighting
 from terrafusion.fusion.weighting.weighting import NOTEWORTHY, NoiseInForce, Weighting
@@ -63,12 +64,13 @@ class TerrainNoise:
         self._labels = config.labels
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
-        self._pooled = fixed
         self._starts_pooled = model.slip_only
         if self._starts_pooled:
             # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
+        self._driven = DrivenSlip(self.policy)
+        self._slips = self._driven.posterior()
         self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=MOST_CHANGES)
         self._recorded: SensorNoise | None = None
@@ -84,12 +86,11 @@ class TerrainNoise:
 
     def learn_slip(self, mean: float, sigma: float, t_ns: int) -> None:
         """Take over the slip that the robot itself shows, for the ground that no class describes."""
-        learned = dataclasses.replace(self._pooled, slip_mean=mean, slip_sigma=sigma)
         if not self.adaptive:
             self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma)
         elif self._starts_pooled:
-            classes = {**self.policy.classes, UNKNOWN: learned}
-            self.policy = dataclasses.replace(self.policy, classes=classes)
+            unknown, (means, sigmas) = self.detector.classes.index(UNKNOWN), self._slips
+            means[unknown], sigmas[unknown] = mean, sigma
             self._reweight(t_ns)
 
     def learned_grounds(self) -> GroundMemory | None:
@@ -162,6 +163,7 @@ class TerrainNoise:
         self._next_ns = state.t_ns + UPDATE_NS
         window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
+        self._learn_driven_slip(window)
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
@@ -170,6 +172,14 @@ class TerrainNoise:
         self._apply_labels(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
+
+    def _learn_driven_slip(self, window: Window) -> None:
+        """Take the slip of the window for that of its ground, where the model knows the robot's grounds."""
+        if not self.adaptive or self._starts_pooled or window.slip is None or window.slip_sigma is None:
+            return
+        if window.ground_speed_mps() > MIN_SPEED_MPS:
+            self._driven.add(self._probabilities, window.slip, window.slip_sigma, self._grade, window.dt_s)
+            self._slips = self._driven.posterior()
 
     def _apply_labels(self, t_ns: int) -> None:
         """Take the ground from the labels, where there are some; the detector runs on, unused."""
@@ -226,7 +236,7 @@ class TerrainNoise:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.noise = self.policy.blend(self._shares, self._grade)
+        self.noise = self.policy.blend(self._shares, self._grade, self._slips)
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)

@@ -202,7 +202,9 @@ def arms_of(log: Recording, outage: Outage) -> dict[str, tuple[str, Known | None
 def replayed(log: Recording, outage: Outage, mode: str, known: Known | None, settings: Any) -> Any:
     """The estimate of one arm."""
     with knowing(known):
-        return replay(log, mode=mode, outages=[outage], settings=settings, watch=tell_time).estimate
+        return replay(
+            log, mode=mode, outages=[outage], settings=settings, watch=tell_time, findings=()
+        ).estimate
 
 
 def ratio(errors: Array, fixed: Array) -> str:

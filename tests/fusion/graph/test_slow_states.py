@@ -97,30 +97,31 @@ def test_what_a_robot_keeps_hardly_moves_in_an_hour(row) -> None:
     assert np.all(hour.sigma[kept] < 0.02 * prior[kept])
 
 
-def test_a_slip_opened_later_keeps_what_else_began_at_that_keyframe() -> None:
+def chain_of(keyframes: int, first_ns: int = 0) -> Chain:
     chain = Chain()
     point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
-    for k in range(4):
-        chain.append(k * 10**8, point, markov=step(rolling(1.0)) if k else None)
+    for k in range(keyframes):
+        chain.append(first_ns + k * 10**8, point, markov=step(rolling(1.0)) if k else None)
+    return chain
+
+
+def test_a_change_seen_late_may_have_been_at_any_keyframe_since() -> None:
+    chain, steady = chain_of(6), step(rolling(1.0)).decay[SLIP]
     drift = slice(1, 3)
-    chain.revise(2, chain.nodes[2].markov.restarted(drift))  # another class of fix
+    chain.revise(3, chain.nodes[3].markov.restarted(drift))  # another class of fix
+    slow_states.inflate_slip_covariance(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, 0.9)
+    decays = np.array([node.markov.decay[SLIP] for node in chain.nodes[1:]])
+    assert decays[0] == steady, "before the change nothing is new"
+    assert np.ptp(decays[1:]) < 1e-12
+    assert np.prod(decays[1:] / steady) == pytest.approx(0.1), "in all it forgets the share that switched"
+    assert chain.nodes[3].markov.decay[drift].tolist() == [0.0, 0.0]
+    slow_states.inflate_slip_covariance(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, 0.2)
+    again = [node.markov.decay[SLIP] for node in chain.nodes[2:]]
+    assert again == decays[1:].tolist(), "a smaller change later closes nothing"
 
-    def open_at_2(switch: float) -> np.ndarray:
-        slow_states.inflate_slip_covariance(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, switch)
-        return chain.nodes[2].markov.decay
 
-    assert open_at_2(0.9)[drift].tolist() == [0.0, 0.0]
-    opened = open_at_2(0.9)[SLIP]
-    assert opened == pytest.approx(0.1 * step(rolling(1.0)).decay[SLIP])
-    assert open_at_2(0.1)[SLIP] == opened, "a smaller change later closes nothing"
-    assert chain.nodes[1].markov.decay[SLIP] == chain.nodes[3].markov.decay[SLIP] > 0.9
-
-
-def test_what_was_seen_late_is_opened_at_the_oldest_keyframe_that_still_can() -> None:
-    chain = Chain()
-    point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
-    for k in range(3):
-        chain.append((5 + k) * 10**8, point, markov=step(rolling(1.0)) if k else None)
+def test_a_change_older_than_what_is_held_is_spread_over_all_that_is() -> None:
+    chain = chain_of(3, first_ns=5 * 10**8)
     slow_states.inflate_slip_covariance(chain, 0, 0.1, SAND, 0.02, 100.0, 1.0)
-    assert chain.nodes[1].markov.decay[SLIP] == 0.0
-    assert chain.nodes[2].markov.decay[SLIP] > 0.9
+    for node in chain.nodes[1:]:
+        assert node.markov.decay[SLIP] == pytest.approx(np.sqrt(1.0 - slow_states.MOST_SWITCH), rel=0.01)

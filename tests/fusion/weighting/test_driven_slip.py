@@ -1,0 +1,83 @@
+"""Slip by ground from the drive itself: the policy's without evidence, the drive's own with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.noise.policy import load_policy
+from terrafusion.fusion.weighting.driven_slip import DrivenSlip
+from terrafusion.twin.model.vehicle import as_vehicle
+
+POLICY = load_policy()
+SAND = POLICY.names().index("loose_sand")
+ON_SAND = np.eye(len(POLICY.names()))[SAND]
+PRIOR, PRIOR_SIGMA, PER_GRADE, TIME_S = POLICY.slips()
+
+
+def driven(seconds: float, slip: float, sigma: float = 0.01, grade: float = 0.0) -> DrivenSlip:
+    """After `seconds` on loose sand with one slip on the level."""
+    found = DrivenSlip(POLICY)
+    for _ in range(round(seconds / 0.5)):
+        found.add(ON_SAND, slip + PER_GRADE[SAND] * grade, sigma, grade, 0.5)
+    return found
+
+
+def test_without_evidence_it_is_the_policys_to_the_last_bit() -> None:
+    mean, sigma = DrivenSlip(POLICY).posterior()
+    assert mean.tolist() == PRIOR.tolist()
+    assert sigma.tolist() == PRIOR_SIGMA.tolist()
+    mixed = np.full(len(PRIOR), 1.0 / len(PRIOR))
+    assert POLICY.blend(mixed, 0.1) == POLICY.blend(mixed, 0.1, (mean, sigma))
+
+
+def test_the_longer_a_ground_is_driven_the_more_its_own_slip_counts() -> None:
+    own = PRIOR[SAND] + 0.03
+    off, spread = [], []
+    for seconds in (0.0, 5.0, 20.0, 80.0, 320.0):
+        mean, sigma = driven(seconds, own).posterior()
+        off.append(own - mean[SAND])
+        spread.append(sigma[SAND])
+    assert off == sorted(off, reverse=True)
+    assert off[-1] < 0.005
+    assert spread[-1] < 0.4 * PRIOR_SIGMA[SAND]
+    assert all(s > abs(o) for s, o in zip(spread, off, strict=True)), "the spread covers what is left"
+
+
+def test_other_grounds_stay_and_the_grade_is_taken_out() -> None:
+    level, uphill = driven(60.0, 0.2).posterior(), driven(60.0, 0.2, grade=0.05).posterior()
+    assert level[0][SAND] == pytest.approx(uphill[0][SAND])
+    others = np.arange(len(PRIOR)) != SAND
+    assert level[0][others].tolist() == PRIOR[others].tolist()
+    assert level[1][others].tolist() == PRIOR_SIGMA[others].tolist()
+
+
+def test_slip_that_is_measured_badly_counts_little_and_slip_that_varies_stays_wide() -> None:
+    own = PRIOR[SAND] + 0.06
+    good, bad = (driven(40.0, own, sigma).posterior()[0][SAND] for sigma in (0.01, 0.2))
+    assert abs(bad - PRIOR[SAND]) < 0.2 * abs(good - PRIOR[SAND])
+    varying = DrivenSlip(POLICY)
+    for k in range(400):
+        varying.add(ON_SAND, 0.13 + (0.15 if k % 20 < 10 else -0.15), 0.01, 0.0, 0.5)
+    assert varying.posterior()[1][SAND] > 0.12
+
+
+@pytest.mark.parametrize("robot", ["elevate", "husky"])
+def test_learned_slip_survives_a_dump(robot: str) -> None:
+    """Of a robot that the terrain model knows, and the slip that self-calibration learns of another one."""
+    config = EstimatorConfig(as_vehicle(robot).rig(), robot)
+    estimator = Estimator(config)
+    weights = estimator.weights
+    if robot == "elevate":
+        weights._driven.add(ON_SAND, 0.3, 0.01, 0.0, 200.0)
+        weights._slips = weights._driven.posterior()
+    else:
+        weights.learn_slip(0.07, 0.05, 0)
+    restored = Estimator.restore(config, estimator.dump()).weights
+    for one in (weights, restored):
+        one.detector._filter.probabilities[:] = ON_SAND if robot == "elevate" else ON_SAND[::-1]
+        one._reweight(0)
+    assert restored.noise == weights.noise
+    assert restored.noise.slip_mean != Estimator(config).weights.noise.slip_mean
