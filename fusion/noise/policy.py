@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.arrays import Array
-
 from terrafusion.datasets.core.config import quantities, structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity, Word

@@ -37,7 +37,7 @@ from terrafusion.twin.simulate import simulate
 DEMO_OUTAGE = Outage(75.0, 60.0)
 DEVELOP = {"demo": range(1000, 1020), "mixed": range(100_000, 100_010)}
 JUDGE = {"demo": range(100, 120), "mixed": range(200_000, 200_010)}
-"""Seeds, written down before anything was changed; "demo" is the demo's drive, "mixed" that of the benchmark."""
+"""Seeds, written down before anything was changed; "demo" is the demo's drive, "mixed" the benchmark's."""
 CAUSES = ("start", "slip", "side-slip", "heading", "corrections")
 LEAST_MPS = 0.15
 KNOWN_SLIP_SIGMA, KNOWN_SLIP_TIME_S = 0.005, 0.05
