@@ -45,7 +45,7 @@ def test_the_estimator_takes_the_row_of_the_label() -> None:
     assert set(ground[before & (told.trajectory.t_ns > told.trajectory.t_ns[0])]) <= {"mud"}
     assert set(ground[after]) == {"asphalt"}
     row = load_policy().classes["asphalt"]
-    np.testing.assert_allclose(told.weights["slip_sigma"][after], row.slip_sigma, rtol=1e-12)
+    np.testing.assert_allclose(told.weights["side_slip_sigma"][after], row.side_slip_sigma, rtol=1e-12)
 
 
 def test_a_dump_with_labels_goes_on() -> None:
