@@ -1,35 +1,23 @@
-"""Fuzzing of all readers and of the log checks: mutated files may be refused, nothing else.
+"""Mutated files of all formats, and what a reader may do with them: read them, or refuse them in one line.
 
-    python tests/datasets/fuzz.py --count 2000 --seed 0
-
-Each input is opened, examined, treated and summed up in a child process of its own, with an alarm
-and a limit on its memory. An outcome is "read" or "refused" (a TerrafusionError of one line);
-"crash", "hang" and "memory" are defects, and the input is kept for a look.
+`python -m tests.studies.fuzz` tries them.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import shutil
-import signal
 import sys
-import tempfile
-import time
 import traceback
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-HANG_S = 10
 MEMORY_BYTES = 1 << 30
-OUTCOMES = {0: "read", 1: "refused", 2: "crash", 3: "memory"}
-DEFECTS = ("crash", "hang", "memory")
 
 Bytes = Callable[[np.random.Generator, bytes], bytes]
 
@@ -165,32 +153,6 @@ def open_and_examine(path: Path, repair_clock: bool) -> None:
         repair(recording)
 
 
-def outcome_in_child(work: Callable[[], int], seconds: float, outcomes: dict[int, str]) -> str:
-    """The outcome of `work`, which returns an exit status, in a child that has so many seconds."""
-    child = os.fork()
-    if child == 0:
-        os._exit(work())
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return outcomes.get(os.waitstatus_to_exitcode(status), "crash")
-        time.sleep(0.002)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return "hang"
-
-
-def outcome_of(path: Path, repair_clock: bool) -> str:
-    """Open `path` in a child, limited in time and memory."""
-    return outcome_in_child(lambda: _in_child(path, repair_clock), HANG_S, OUTCOMES)
-
-
-def _in_child(path: Path, repair_clock: bool) -> int:
-    limit_memory()
-    return examined(path, repair_clock)
-
-
 def cpu_s(process: int) -> float:
     """Processor time of a running process, s; 0 where it has gone."""
     try:
@@ -228,51 +190,3 @@ def examined(path: Path, repair_clock: bool) -> int:
         traceback.print_exc()
         return 2
     return 0
-
-
-def run(count: int, seed: int, samples: list[Path], scratch: Path) -> Iterator[tuple[Path, str, float]]:
-    """(input, outcome, seconds) of `count` mutated inputs, the samples in turn."""
-    for i in range(count):
-        rng = np.random.default_rng([seed, i])
-        folder = Path(tempfile.mkdtemp(dir=scratch, prefix=f"{i:05d}-"))
-        path = mutated(rng, samples[i % len(samples)], folder)
-        begun = time.monotonic()
-        outcome = outcome_of(path, repair_clock=bool(rng.random() < 0.5))
-        yield path, outcome, time.monotonic() - begun
-        if outcome not in DEFECTS:
-            shutil.rmtree(folder)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--count", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="samples whose name contains this")
-    options = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parent))
-    from fuzz_samples import write_samples
-
-    scratch = Path(tempfile.mkdtemp(prefix="fuzz-"))
-    samples = [path for path in write_samples(scratch / "samples") if options.only in path.name]
-    for sample in samples:  # in this process, so that every child starts with the parsers in memory
-        open_and_examine(sample / (sample / ".open").read_text(), repair_clock=False)
-    counts: Counter[tuple[str, str]] = Counter()
-    slowest = 0.0
-    for path, outcome, seconds in run(options.count, options.seed, samples, scratch):
-        counts[path.relative_to(scratch).parts[1], outcome] += 1
-        slowest = max(slowest, seconds)
-        if outcome in DEFECTS:
-            print(f"{outcome}: {path}")
-    for name in sorted({name for name, _ in counts}):
-        told = ", ".join(f"{outcome} {counts[name, outcome]}" for outcome in (*OUTCOMES.values(), "hang"))
-        print(f"{name:16} {told}")
-    defects = sum(n for (_, outcome), n in counts.items() if outcome in DEFECTS)
-    read = sum(n for (_, outcome), n in counts.items() if outcome == "read")
-    print(f"{options.count} inputs, {read} read, {defects} defects, slowest {slowest:.2f} s")
-    if not defects:
-        shutil.rmtree(scratch)
-    return int(defects > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A small fixed part of the fuzzing: `python tests/datasets/fuzz.py --count 2000` is the whole."""
+"""A small fixed part of the fuzzing: `python -m tests.studies run fuzz` is the whole."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[2]
+CASES = {"readers": 96, "yaml": 30, "live": 0, "cli": 12}
+
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the fuzzer limits memory as Linux does")
-def test_mutated_files_are_read_or_refused() -> None:
-    script = Path(__file__).parent / "fuzz.py"
+def test_damaged_input_is_used_or_refused(tmp_path: Path) -> None:
+    counts = [word for kind, count in CASES.items() for word in (f"--{kind}", str(count))]
     done = subprocess.run(
-        [sys.executable, str(script), "--count", "112", "--seed", "7"],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    read, defects = map(int, re.findall(r"(\d+) read, (\d+) defects", done.stdout)[0])
-    assert defects == 0
-    assert 5 < read < 100  # neither all that harmless nor all refused at the door
+        [sys.executable, "-m", "tests.studies.fuzz", *counts, "--seed", "7", "--out", str(tmp_path)],
+        cwd=ROOT, capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"all {sum(CASES.values())} cases, defects 0" in done.stdout, done.stdout + done.stderr
+    for kind, fewest in (("readers", 5), ("yaml", 0), ("cli", 0)):  # neither all harmless nor all refused
+        (worked,) = map(int, re.findall(rf"{kind} .*worked (\d+)", done.stdout))
+        assert fewest <= worked < 0.9 * CASES[kind], done.stdout

@@ -423,11 +423,5 @@ STUDIES = (
         ("tests/datasets/bench_bags.py",),
         3,
     ),
-    Study(
-        "reader_fuzz",
-        "Do mutated files crash, hang or bloat a reader?",
-        ("tests/datasets/fuzz.py",),
-        15,
-    ),
 )
 """All of them, quick ones and long ones."""
