@@ -114,8 +114,8 @@ def replay(
 
     rig = drive.config.rig
     found = run_checks(recording, rig) if findings is None else findings
-    delay_s = estimator.learned.uncorrected_delay_s()
-    verdict = judge(Run(recording, estimate, scores, rivals, drive.used, found, rig, delay_s))
+    delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
+    verdict = judge(Run(recording, estimate, scores, rivals, drive.used, found, rig, delay_s, corrected))
     return ReplayResult(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
         drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,

@@ -6,7 +6,7 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,8 +135,11 @@ def clock_accepted(recording: Recording) -> Recording:
     return dataclasses.replace(recording, clock_jumps=()).with_notes(*notes)
 
 
-def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> list[Finding]:
-    """Refuse a log whose numbers would mislead: what the log checks call an error; gives their warnings.
+def refuse_errors(
+    log: str, recording: Recording, rig: Rig | None, learned: Collection[str] = ()
+) -> list[Finding]:
+    """Refuse a log whose numbers would mislead: what the log checks call an error, but for those codes whose
+    numbers are `learned` from the drive; gives the others.
 
     Raises:
         DataError: the first such finding, with its evidence and what to do.
@@ -144,7 +147,7 @@ def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> list[Findi
     from terrafusion.datasets.checks import run_checks
 
     findings = run_checks(recording, rig_of(recording, rig))
-    _refuse(log, findings)
+    _refuse(log, [finding for finding in findings if finding.code not in learned])
     return findings
 
 

@@ -28,6 +28,8 @@ from terrafusion.fusion.cli.common import (
 from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
+    from terrafusion.datasets.checks import Finding
+    from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
     from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.replay import ReplayResult
 
@@ -151,7 +153,7 @@ def replay(
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
     if repair_clock:
         recording = clock_accepted(recording)
-    findings = refuse_errors(log, recording, rig)
+    findings = refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording,
@@ -172,7 +174,7 @@ def replay(
     unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
-    warnings = [f"log check, {f.channel}: {f.what} ({f.evidence}); {f.fix}" for f in findings]
+    warnings = [_warning(finding, result.learned) for finding in findings]
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
     done = f"written to {out}"
     return Result(
@@ -182,6 +184,16 @@ def replay(
         short=f"{result.verdict.lines()[0]}; {done}",
         vehicle=result.vehicle,
     )
+
+
+def _warning(finding: Finding, learned: Sequence[NumberAfterDrive]) -> str:
+    """A finding of the log checks as a line, with its remedy unless the drive gave it."""
+    from terrafusion.fusion.metrics.verdict import LEARNED
+
+    settling = LEARNED.get((finding.code, finding.channel))
+    corrected = any(number.corrects and number.state == settling for number in learned)
+    remedy = "self-calibration corrects it" if corrected else finding.fix
+    return f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {remedy}"
 
 
 def _write_bag(result: ReplayResult, path: Path) -> list[str]:

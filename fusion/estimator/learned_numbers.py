@@ -160,6 +160,10 @@ class LearnedNumbers:
             numbers.append(NumberAfterDrive("imu_yaw_rad", angle.rad, *sigmas, self.mounting.corrects))
         return tuple(numbers)
 
+    def corrected(self) -> frozenset[str]:
+        """Names of the numbers that correct a sensor."""
+        return frozenset(number.state for number in self.table() if number.corrects)
+
     def uncorrected_delay_s(self) -> tuple[float, float] | None:
         """Lateness of the fixes beyond what was known, 1 sigma; None where corrected or not learned."""
         if self.calibration is None or self._clear[CORRECTED.index(GNSS_DELAY)]:

@@ -92,8 +92,8 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
         antenna_m=antenna_m, aligned=local,
     )  # fmt: skip
     found = run_checks(recording, rig)
-    delay_s = estimator.learned.uncorrected_delay_s()
-    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig, delay_s))
+    delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
+    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig, delay_s, corrected))
 
 
 def run(

@@ -7,7 +7,7 @@ own covariance. The limits are constants below; docs/reference/verdict.md lists 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,9 @@ REPORTED = (
 """Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
 the estimator estimates itself, such as small scale errors and the receiver's delay, or cost accuracy only. It
 does not estimate delays of IMU and wheels: an offset of their clocks counts, too."""
+LEARNED = {("imu-forward", "imu"): "imu_yaw_rad", ("clock-offset", "gnss"): "gnss_delay_s"}
+"""The number of the robot that settles a finding of the log checks where the estimator corrected it, by code
+and channel."""
 DELAY_SIGMAS = 2.0
 """A delay of the fixes is likely from so many of its sigmas on (95 %)."""
 
@@ -98,6 +101,8 @@ class Run:
     rig: Rig
     delay_s: tuple[float, float] | None = None
     """Lateness of the fixes as learned, and its 1 sigma, where it was not corrected."""
+    corrected: Collection[str] = ()
+    """Numbers of the robot that the estimator corrected by what the drive showed."""
 
 
 Reason = tuple[str, str]
@@ -308,6 +313,8 @@ def _rejections(run: Run) -> Iterator[Reason]:
 
 def _log(run: Run) -> Iterator[Reason]:
     for finding in run.findings:
+        if LEARNED.get((finding.code, finding.channel)) in run.corrected:
+            continue
         clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
         if finding.severity == "error" or finding.code in REPORTED or clock:
             yield (

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
@@ -70,3 +71,20 @@ def test_the_file_carries_the_angle_to_the_next_drive(run: Recording, tmp_path: 
     robot = load_vehicle(write_robot(tmp_path / "my_robot.yaml", found))
     estimator = Estimator(EstimatorConfig(robot.rig(), robot.name))
     assert estimator.imu.mounting_rad == pytest.approx(ANGLE_RAD, abs=math.radians(5.0))
+
+
+def test_a_corrected_imu_is_no_reason_for_doubt_and_none_to_refuse(
+    run: Recording, tmp_path: Path, terrafusion
+) -> None:
+    """A quarter turn, which the log checks call an error; with `--calibrate` the angle is not learned."""
+    turn_rad = 0.5 * math.pi
+    log = write_log_folder(mounted(run, turn_rad - ANGLE_RAD), tmp_path / "log")
+    assert terrafusion("inspect", log).status == 1
+    outcome = terrafusion("replay", log, "--mode", "fixed", "--out", tmp_path / "out")
+    assert outcome.status == 0, outcome.err
+    verdict = outcome.out.partition(f"{run.name}:")[0]
+    assert "point forward" not in verdict
+    line = next(line for line in outcome.out.splitlines() if line.startswith("log check, imu: x does not"))
+    assert line.endswith("deg); self-calibration corrects it")
+    refused = terrafusion("replay", log, "--calibrate", "--out", tmp_path / "calibrated")
+    assert refused.refused("x does not point forward", "--apply-fixes")
