@@ -34,6 +34,8 @@ YAW_PER_S_RAD = 2e-4
 """Error of a link's turn by a wandering bias, rad per second."""
 CAUCHY_SQUARE = 6.0
 """Squared normalised residual of a fix (two axes) at which it counts half: 95 % of good ones are below."""
+MOST_SHARED = 0.95
+"""Largest correlation of successive residuals that is allowed for (assumed)."""
 SLICE_SAMPLES, SLICE_FIXES = 400, 200
 """Samples and fixes of a slice at most, but one node at least: they bound its computing time."""
 _ROW, _COLUMN = np.meshgrid(np.arange(NODE), np.arange(NODE), indexing="ij")
@@ -161,7 +163,8 @@ class Reduction:
 
     def _assemble_fixes(self) -> None:
         square = np.einsum("fr,fr->f", self.left, self.left)
-        self.misfit = usual = max(1.0, float(np.median(square)) / 1.386)
+        scatter = float(np.median(square)) / 1.386
+        self.misfit, usual = max(1.0, scatter), max(1.0, scatter * _inflation(self.left))
         chosen = slice(self.done_fixes, self.done_fixes + SLICE_FIXES)
         weight = np.sqrt(1.0 / (1.0 + square[chosen] / (CAUCHY_SQUARE * usual)) / usual)
         rows, left = self.rows[chosen] * weight[:, None, None], self.left[chosen] * weight[:, None]
@@ -285,6 +288,20 @@ class Reduction:
             start[0, 0, DRIFT_E] = start[0, 1, DRIFT_N] = 1.0 / sigma_m
             out.append((start, self.part.state[:1, DRIFT_E:] / sigma_m, every[:1], 1))
         return out
+
+
+def _inflation(left: Array) -> float:
+    """Factor on the variance of fixes, for residuals (F, 2) that do not scatter from one fix to the next.
+
+    With a correlation r of successive ones, n of them tell of a constant what n (1 - r) / (1 + r) independent
+    ones do (Bartlett 1946, J. R. Stat. Soc. Suppl. 8).
+    """
+    size = np.hypot(left[:, 0], left[:, 1])
+    held = left / np.maximum(size / (2.0 * np.median(size) + 1e-9), 1.0)[:, None]  # a wild fix counts less
+    total = float(np.einsum("fr,fr->", held, held))
+    shared = float(np.einsum("fr,fr->", held[1:], held[:-1])) / total if total > 0.0 else 0.0
+    shared = min(max(shared, 0.0), MOST_SHARED)
+    return (1.0 + shared) / (1.0 - shared)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from terrafusion.fusion.calibration.fit import fit, information_gained, refined,
 from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_starts
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
+    ANTENNA_Y,
     GNSS_DELAY,
     NUMBERS,
     TURN_SCALE,
@@ -122,6 +125,32 @@ def test_errors_are_covered_by_their_sigmas(sigma_m: float) -> None:
     assert np.mean(np.abs(np.array(errors)[:, :6]) < 2.0) > 0.85
 
 
+def correlated(count: int, sigma: float, share: float, rng: np.random.Generator) -> Array:
+    """Noise (count, 2) of which each value keeps `share` of the one before."""
+    noise = rng.normal(0.0, sigma, (count, 2))
+    for i in range(1, count):
+        noise[i] = share * noise[i - 1] + np.sqrt(1.0 - share**2) * noise[i]
+    return noise
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_correlated_residuals_count_for_as_many_independent_ones(share: float) -> None:
+    found = reduction._inflation(correlated(4000, 1.0, share, np.random.default_rng(4)))
+    assert found == pytest.approx((1.0 + share) / (1.0 - share), rel=0.15)
+
+
+def test_sigmas_cover_errors_of_fixes_that_move_together() -> None:
+    square = []
+    for seed in range(10):
+        drive = figure(150.0, seed=seed)
+        noise = correlated(len(drive.fix), 0.15, 0.8, np.random.default_rng(seed))
+        fix, claimed = drive.fix + noise @ np.array([1.0, 1.0j]), np.full(len(noise), 0.02)
+        found = fit([dataclasses.replace(drive, fix=fix, fix_sigma_m=claimed)], [(0j, 0.0)], PRIOR, NOISE)
+        off = (found.mean - TRUE) / found.sigma
+        square.append(off[[TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]] ** 2)
+    assert np.mean(square) < 1.5
+
+
 def test_two_drives_tell_more_than_one() -> None:
     drives = [figure(120.0, fix_sigma_m=0.3, seed=seed) for seed in (1, 2)]
     one = fit(drives[:1], [(0j, 0.0)], PRIOR, NOISE)
@@ -153,6 +182,7 @@ def test_a_step_never_loses_information() -> None:
 
 def test_slices_give_the_dense_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reduction, "CAUCHY_SQUARE", np.inf)
+    monkeypatch.setattr(reduction, "MOST_SHARED", 0.0)
     nodes = started(figure(600.0, fix_sigma_m=0.0), 0j, 0.0, TRUE)
     nodes.state[:, :2] *= 1.0 + TRUE[WHEEL_SCALE]
     nodes.state[:, 0] += 0.005
