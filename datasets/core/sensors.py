@@ -165,3 +165,10 @@ class Rig:
     wheelbase_m: float = 0.5
     steering: SteeringSpec | None = None
     known: SensorNumbers = field(default_factory=SensorNumbers)
+
+    @property
+    def ahead_m(self) -> float:
+        """How far the body's origin, midway between the axles, lies ahead of the point that follows the
+        wheels: the middle of the rear axle where the front wheels alone steer, else the origin itself.
+        """
+        return 0.5 * self.wheelbase_m if self.drive == "ackermann" else 0.0

@@ -171,12 +171,17 @@ def checked_start(
 
 
 def heading_from_motion(
-    imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix], level: Start, antenna_m: Array
+    imu: ImuStream,
+    wheels: WheelStream,
+    fixes: list[GnssFix],
+    level: Start,
+    antenna_m: Array,
+    ahead_m: float = 0.0,
 ) -> Start | None:
     """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
 
     Positions and velocities show the same turn, so their sums add up (see `planar_rotation`). None with
-    fewer than three fixes, or while the fixes hardly move though the wheels do.
+    fewer than three fixes, or while the fixes hardly move though the wheels do. `ahead_m`: of the `Rig`.
     """
     times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
     inside = [f for f in fixes if len(times) and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
@@ -185,7 +190,7 @@ def heading_from_motion(
     yaw_at, path_at = _dead_reckon(imu, wheels, level)
     t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
     heading = np.exp(1j * yaw_at(t_fix))
-    lever = complex(antenna_m[0], antenna_m[1])
+    lever = complex(ahead_m + antenna_m[0], antenna_m[1])
     z = path_at(t_fix) + lever * heading
     g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
     weight = np.array([1.0 / (f.sigma_m[0] * f.sigma_m[1]) for f in inside])
@@ -203,11 +208,12 @@ def heading_from_motion(
     yaw = float(np.angle(turn))
     origin = np.average(g, weights=weight) - np.exp(1j * yaw) * np.average(z, weights=weight)
     off = _excess(g - origin - np.exp(1j * yaw) * z, z, weight)
+    body = origin + ahead_m * np.exp(1j * yaw)
     heights = np.array([f.enu_m[2] for f in inside])
     height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
     return dataclasses.replace(
         level,
-        position_m=np.array([origin.real, origin.imag, height]),
+        position_m=np.array([body.real, body.imag, height]),
         position_sigma_m=float(5.0 * off / np.sqrt(weight.max())) + 0.05,
         yaw_rad=yaw,
         yaw_sigma_rad=off * information**0.5 / abs(turn),

@@ -261,9 +261,7 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
         1.0 - WHITE_SHARE,
         max(sensors.gnss.correlation_time_s, 1.0),
     )
-    antenna_m = complex(*sensors.gnss.antenna_m[:2])
-    if config.rig.drive == "ackermann":  # it is the middle of the rear axle that the path describes
-        antenna_m += 0.5 * config.rig.wheelbase_m
+    antenna_m = complex(*sensors.gnss.antenna_m[:2]) + config.rig.ahead_m
     return SelfCalibration(prior, noise, antenna_m)
 
 

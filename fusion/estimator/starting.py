@@ -42,7 +42,7 @@ class StartSearch:
         self.level: Start | None = None
         self._rough: Start | None = None
         self._config, self._aids, self._gnss = config, aids, gnss
-        self._antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
+        self._antenna_m, self._ahead_m = np.array(config.rig.sensors.gnss.antenna_m), config.rig.ahead_m
 
     def find(self, imu: ImuStream, wheels: WheelStream, last: bool) -> Start | None:
         """The start, or None as long as there is none; `last`: no more samples will come."""
@@ -63,7 +63,8 @@ class StartSearch:
         fixes = self._gnss.waiting
         if fixes and self._gnss.have_new():
             fitting = plausible_fixes(fixes, wheels)
-            start = heading_from_motion(imu, wheels, fitting, self.level, self._antenna_m)
+            place = self._antenna_m, self._ahead_m
+            start = heading_from_motion(imu, wheels, fitting, self.level, *place)
             if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
                 self._gnss.refuse_waiting(fitting)
                 return start

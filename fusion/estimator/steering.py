@@ -71,7 +71,7 @@ class SteeredTurn:
         scale = WHEEL_RATIO_SIGMA if of_steering_wheel and spec.ratio is None else max(spec.scale_sigma, 0.02)
         self._first = np.array([scale, max(spec.offset_sigma_rad, 1e-3) / rig.wheelbase_m])
         self._floor_per_m = CURVATURE_FLOOR / rig.wheelbase_m
-        self._ahead_m = 0.5 * rig.wheelbase_m if rig.drive == "ackermann" else 0.0
+        self._ahead_m = rig.ahead_m
         self.mean: Array = np.zeros(2)
         self.covariance: Array = np.diag(self._first**2)
 

@@ -265,3 +265,26 @@ def test_fixes_that_disagree_widen_the_start() -> None:
     assert honest.yaw_sigma_rad < 0.05
     assert wild.yaw_sigma_rad > 10.0 * honest.yaw_sigma_rad
     assert wild.position_sigma_m > 10.0 * honest.position_sigma_m
+
+
+def test_a_robot_that_steers_starts_where_its_origin_is_and_not_its_rear_axle() -> None:
+    estimator, ahead_m, antenna_m = Estimator.for_vehicle("elevate"), 1.3, np.array([0.4, -0.2, 0.0])
+    speed_mps, yaw_rad, origin = 2.0, 0.7, 10.0 + 5.0j
+    axle, yaw, fixes = origin - ahead_m * np.exp(1j * yaw_rad), yaw_rad, []
+    for i in range(1500):
+        t_ns, rate_radps = i * 10_000_000, 0.3 + 0.2 * np.sin(0.01 * i)
+        if i:
+            yaw += 0.01 * rate_radps
+            axle += 0.01 * speed_mps * np.exp(1j * (yaw - 0.005 * rate_radps))
+        estimator.add_imu(t_ns, [0.0, 0.0, rate_radps], [0.0, speed_mps * rate_radps, 9.81])
+        if i % 5 == 0:
+            estimator.add_wheels(t_ns, speed_mps, speed_mps)
+        if i >= 200 and i % 20 == 0:
+            at = axle + (ahead_m + complex(*antenna_m[:2])) * np.exp(1j * yaw)
+            fixes.append(GnssFix(t_ns, np.array([at.real, at.imag, 0.0]), np.full(3, 0.02)))
+    level = level_start(estimator.imu, estimator.wheels, 0)
+    level = dataclasses.replace(level, roll_rad=0.0, pitch_rad=0.0)
+    start = heading_from_motion(estimator.imu, estimator.wheels, fixes, level, antenna_m, ahead_m)
+    assert start is not None
+    assert start.yaw_rad == pytest.approx(yaw_rad, abs=0.02)
+    assert start.position_m[:2] == pytest.approx([origin.real, origin.imag], abs=0.05)
