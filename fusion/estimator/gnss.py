@@ -356,7 +356,8 @@ class GnssUpdater:
             return False
         if self._pair is not None:
             self.plausible.accepted(self._pair, verdict is GateDecision.REACQUIRE)
-        self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
+        own_m2 = float(np.sum(np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2))
+        self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]], own_m2)
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
         cut = cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)

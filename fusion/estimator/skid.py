@@ -141,8 +141,9 @@ class SkidDetector:
             return segments, wheels
         return self.friction.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
 
-    def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
-        """Adapt the rate to a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
+    def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array, fix_m2: float) -> None:
+        """Adapt the rate to a fix that is used: `innovation_m` (2,), the variances (2,) predicted for it, and
+        its own, the sum of both axes.
 
         Wheels that are trusted too much leave innovations on one side; the innovations of the right filter
         are white. Coarse fixes say nothing of a rate that adds up to less than their variance.
@@ -152,7 +153,7 @@ class SkidDetector:
             return
         self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
         before_m, self._before_m = self._before_m, innovation_m
-        telling = float(np.sum(predicted_m2)) <= max(2.0 * self.rate_m2ps * MEMORY_S, COARSE_M2)
+        telling = fix_m2 <= max(2.0 * self.rate_m2ps * MEMORY_S, COARSE_M2)
         if self.rate_m2ps and driven_s > 0.0 and telling:
             more_m2 = 0.5 * min(float(innovation_m @ before_m), float(np.sum(innovation_m**2 - predicted_m2)))
             beyond = more_m2 / driven_s

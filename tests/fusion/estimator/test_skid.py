@@ -137,7 +137,7 @@ def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -
 
     def told(k: int, innovation_m: float) -> float:
         slide.with_extra_variance(wheels, state, 1.0)
-        slide.accepted(k * 10**9, np.full(2, innovation_m), np.full(2, 0.02 + slide.rate_m2ps))
+        slide.accepted(k * 10**9, np.full(2, innovation_m), np.full(2, 0.02 + slide.rate_m2ps), 0.04)
         return slide.rate_m2ps
 
     told(1, 0.0)
@@ -145,6 +145,17 @@ def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -
     falling = [told(k, 0.0) for k in range(40, 100)]
     assert falling[0] > falling[10] > falling[-1] == 0.0
     assert told(200, 5.0) == 0.0  # a fix that the gate lets in refutes nothing
+
+
+def test_after_an_outage_a_fine_fix_still_tells_of_a_slide_and_a_coarse_one_does_not() -> None:
+    wheels, doubt_m2 = WheelIncrement(np.array([3.0, 0.0, 0.0]), np.full(4, 0.01), 3.0, 0.0), 30.0
+    for fix_m2, told in ((0.02, True), (9.0, False)):
+        slide = SkidDetector()
+        slide.rate_m2ps = 0.2
+        slide.with_extra_variance(wheels, moving(3.0), 1.0)
+        before = slide.rate_m2ps
+        slide.accepted(10**9, np.zeros(2), np.full(2, doubt_m2), fix_m2)
+        assert (slide.rate_m2ps < before) == told
 
 
 def track_of(points_m: np.ndarray, sigma_m: float, step_s: float = 0.2) -> DeadReckoning:
