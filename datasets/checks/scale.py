@@ -1,4 +1,6 @@
-"""Wheel speed compared with the speed over ground: unit, radius, slip."""
+"""Scales: wheel speed against the speed over ground (unit, radius, slip), and the gyro about z against the
+yaw of the truth, else against the shape of the measured path.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,12 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled
-from terrafusion.datasets.checks.motion import wheel_speed
-from terrafusion.datasets.checks.path import PathScale, scales
+from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed_field, scaled
+from terrafusion.datasets.checks.motion import common_span, wheel_speed, yaw_angles
+from terrafusion.datasets.checks.path import PathScale, path_by, scales
+from terrafusion.datasets.checks.path_model import path_model
+from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
@@ -29,6 +34,15 @@ FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
 STEEPEST = 0.05
 """Mean descent above which a robot may roll faster than its braked wheels."""
+YAW_WINDOW_S, LEAST_YAW_WINDOWS, LEAST_YAW_R = 4.0, 12, 0.95
+"""Yaw rates are compared as means over windows so long that a delay hardly matters."""
+PATH_WINDOWS = 8
+LARGE_GYRO, SURE_GYRO, WIDEST_GYRO = 0.02, 0.01, 0.05
+"""A scale error counts from the first on, with its interval beyond the second and narrower than the third."""
+MOST_GYRO_MISSING = 0.01
+"""With more empty cells, as where a range was exceeded, turns are missing: no scale."""
+MOST_GYRO = 0.2
+"""Beyond this it is no scale, but another unit or axis."""
 
 
 @dataclass(frozen=True)
@@ -158,3 +172,56 @@ def is_firm(recording: Recording) -> bool:
     if recording.terrain is not None:
         labels |= set(map(str, recording.terrain.label.tolist()))
     return not labels & set(SOFT)
+
+
+def check_gyro_scale(context: CheckContext) -> Iterator[Finding]:
+    """The gyro must turn as far as the robot does."""
+    imu = context.recording.imu
+    if imu is None or np.isnan(imu.gyro_radps[:, 2]).mean() > MOST_GYRO_MISSING:
+        return
+    found = _by_truth(context) or _by_path(context)
+    if found is None:
+        return
+    error, source = found
+    if (
+        not LARGE_GYRO < abs(error.value) < MOST_GYRO
+        or not error.is_beyond(SURE_GYRO)
+        or error.high - error.low > WIDEST_GYRO
+    ):
+        return
+    factor = 1.0 / (1.0 + error.value)
+    yield Finding(
+        "gyro-scale", "warning", "imu",
+        f"gyro z reads {abs(error.value):.1%} too {'much' if error.value > 0.0 else 'little'}",
+        f"{1.0 + error.value:.4f} times the turns by {source}, 95 % interval {1.0 + error.low:.4f} to "
+        f"{1.0 + error.high:.4f}",
+        f"multiply gyro z by {factor:.4f}",
+        changed_field("imu", "gyro_radps", lambda rates: rates * (1.0, 1.0, factor)),
+    )  # fmt: skip
+
+
+def _by_truth(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
+    known = yaw_angles(context)
+    if "gyro" not in known or "truth" not in known:
+        return None
+    gyro, truth = known["gyro"], known["truth"]
+    start, end = common_span(gyro, truth)
+    if not end - start >= (LEAST_YAW_WINDOWS + 1) * YAW_WINDOW_S:
+        return None
+    grid = np.arange(start, end, YAW_WINDOW_S)
+    x, y = truth.rates(grid), gyro.rates(grid)
+    if min(x.std(), y.std()) <= 0.0 or np.corrcoef(x, y)[0, 1] < LEAST_YAW_R:
+        return None
+    draws = np.concatenate([np.arange(len(x))[None], resampled_rows(len(x), RESAMPLES, SEED)])
+    a, b = (values[draws] - values[draws].mean(axis=1, keepdims=True) for values in (x, y))
+    slope = np.sqrt((b**2).sum(axis=1) / np.maximum((a**2).sum(axis=1), 1e-12)) - 1.0
+    return interval_of(float(slope[0]), slope[1:], len(x)), "the truth's yaw"
+
+
+def _by_path(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
+    for source, name in (("gnss", "the path of the fixes"), ("truth", "the path of the truth")):
+        path = path_by(context.recording, source)
+        model = path_model(context, path) if path is not None else None
+        if model is not None and model.windows >= PATH_WINDOWS:
+            return model.gyro_scale, name
+    return None

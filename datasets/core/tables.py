@@ -35,10 +35,9 @@ def text_table(heads: Sequence[str], rows: Rows, *, right: Collection[int] = (),
     ]
 
 
-def markdown_table(heads: Sequence[str], rows: Rows, *, right: Collection[int] = ()) -> list[str]:
-    """Lines of a Markdown table; bars in cells are escaped, the columns `right` are aligned to the right."""
+def markdown_table(heads: Sequence[str], rows: Rows) -> list[str]:
+    """Lines of a Markdown table; bars in cells are escaped."""
     top, *body = [
         "| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in [heads, *rows]
     ]
-    rule = "".join(" ---: |" if k in right else " --- |" for k in range(len(heads)))
-    return [top, f"|{rule}", *body]
+    return [top, "|" + " --- |" * len(heads), *body]

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import HowRead
 
 SubjectsArgument = Annotated[
     list[str] | None,
@@ -28,7 +29,6 @@ def allan(subjects: SubjectsArgument = None) -> Result:
 
     terrafusion allan parked.mcap
     """
-    from terrafusion.fusion.cli.common import opened, reading
     from terrafusion.twin.analysis.allan import recording_lines, vehicle_lines
     from terrafusion.twin.model.vehicle import vehicle_names
 
@@ -37,6 +37,6 @@ def allan(subjects: SubjectsArgument = None) -> Result:
         if subject in vehicle_names() or subject.endswith((".yaml", ".yml")):
             lines += vehicle_lines(subject)
             continue
-        for recording in opened([subject], reading(None, None, "header", None, False), False):
+        for recording in HowRead().open_all([subject], None):
             lines += recording_lines(recording)
     return Result(lines)

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
-    ColumnsOption,
-    RepairClockOption,
-    StampsOption,
-    TopicOption,
+    HowRead,
     command_line,
     load_rig,
-    opened,
     progress_bar,
     read_json,
-    reading,
     refuse_impossible,
 )
 from terrafusion.fusion.cli.outputs import Output
@@ -90,10 +85,7 @@ def calibrate(
         bool,
         typer.Option("--suggest", help="Suggest manoeuvres that would identify the unresolved parameters."),
     ] = False,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
-    repair_clock: RepairClockOption = False,
+    how: HowRead = HowRead(),  # noqa: B008 (frozen)
 ) -> Result:
     """Fit soil and vehicle parameters to logs, with their sigma and what the logs cannot identify.
 
@@ -106,8 +98,7 @@ def calibrate(
     if sensors:
         if terrain or parameters or prior or suggest or truth or channels or robust:
             raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
-        options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-        return _sensors(logs, vehicle, options, out, repair_clock)
+        return _sensors(logs, vehicle, how, out)
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
@@ -119,8 +110,7 @@ def calibrate(
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
     vehicle = vehicle or "elevate"
-    options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-    recordings = opened(logs, options, repair_clock)
+    recordings = how.open_all(logs, load_rig(vehicle))
     with progress_bar("calibrating") as progress:
         found = fit(
             recordings, vehicle, soils, split(parameters) or PARAMETERS, priors=priors, source=source,
@@ -141,9 +131,7 @@ def _suggested(found: Calibration) -> list[str]:
     return [suggestion.sentence() for suggestion in suggestions(found)]
 
 
-def _sensors(
-    logs: list[str], vehicle: str | None, options: dict[str, Any], out: Path, repair_clock: bool
-) -> Result:
+def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path) -> Result:
     """Learn the sensor numbers of a robot, and write its file."""
     import dataclasses
 
@@ -153,7 +141,7 @@ def _sensors(
 
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
-    recordings = opened(logs, options, repair_clock)
+    recordings = how.open_all(logs, load_rig(vehicle))
     for recording in recordings:
         refuse_impossible(recording.name, recording)
     with progress_bar("calibrating") as progress:

@@ -9,16 +9,17 @@ import io
 import json
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.printable import printable
-from terrafusion.fusion.cli.common import PROGRESS
+from terrafusion.fusion.cli import common
+from terrafusion.fusion.cli.common import PROGRESS, HowRead
 from terrafusion.fusion.cli.outputs import Output, check_file, parts_of
 
 PANEL = "Options of all commands"
@@ -80,7 +81,8 @@ def add_command(
     """Make a function a command that has the shared options.
 
     Args:
-        body: takes the command's own options and, where it writes, `out: Path`; returns what to print.
+        body: takes the command's own options and, where it writes, `out: Path`; returns what to print. A
+            parameter of the type `HowRead` stands for the options of that class.
         output: what it writes at `out`; gives a plain `out: Path` the option `--out`.
         instead: what it writes with an option that is called so.
         files: options that are further files to write, each with a word of the files it may replace.
@@ -95,7 +97,8 @@ def add_command(
         for word, kind in shared.items()
     ]
 
-    own = {one.name: one.replace(kind=one.KEYWORD_ONLY) for one in signature.parameters.values()}
+    own = {one.name: one for one in _spread_out(signature.parameters.values())}
+    how_read = next((one.name for one in signature.parameters.values() if one.annotation is HowRead), None)
     if output is not None and own["out"].annotation is Path:
         option = Annotated[Path | None, typer.Option("--out", help=f"{output.help} Default: a dated name.")]
         own["out"] = own["out"].replace(annotation=option, default=None)
@@ -115,7 +118,7 @@ def add_command(
             print("\n".join(f"{key} = {value}" for key, value in given.items()), file=sys.stderr)
         try:
             with _told(how["quiet"], how.get("as_json", False)):
-                result = body(**given)
+                result = body(**_gathered(given, how_read))
                 if kind is not None and "config.json" in kind.names:
                     from terrafusion.fusion.cli.used_config import write_config
 
@@ -136,6 +139,28 @@ def add_command(
     command.__signature__ = signature.replace(parameters=everything)  # type: ignore[attr-defined]
     command.__annotations__ = {one.name: one.annotation for one in everything}
     app.command(name)(command)
+
+
+def _spread_out(parameters: Iterable[inspect.Parameter]) -> Iterator[inspect.Parameter]:
+    """The parameters by keyword; in place of one of the type `HowRead` its options."""
+    kinds = get_type_hints(HowRead, vars(common), include_extras=True)
+    for one in parameters:
+        if one.annotation is not HowRead:
+            yield one.replace(kind=one.KEYWORD_ONLY)
+            continue
+        for option in fields(HowRead):
+            kind = kinds[option.name]
+            yield inspect.Parameter(option.name, one.KEYWORD_ONLY, default=option.default, annotation=kind)
+
+
+def _gathered(given: Mapping[str, Any], how_read: str | None) -> dict[str, Any]:
+    """The arguments of a command's body, with the options of `HowRead` in its parameter of that name."""
+    if how_read is None:
+        return dict(given)
+    options = {option.name: given[option.name] for option in fields(HowRead)}
+    return {name: value for name, value in given.items() if name not in options} | {
+        how_read: HowRead(**options)
+    }
 
 
 @contextlib.contextmanager

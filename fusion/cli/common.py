@@ -1,4 +1,4 @@
-"""Options of a log, opening and checking it, and progress: shared by the commands."""
+"""What commands share: options of a log and of workers, opening and checking a log, and progress."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.datasets.core.sensors import Rig
+
 
 LogArgument = Annotated[
     str,
@@ -51,6 +52,14 @@ ColumnsOption = Annotated[
 RepairClockOption = Annotated[
     bool,
     typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log."),
+]
+JobsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Processes on this machine; by default one a processor.", show_default=False),
+]
+BackendOption = Annotated[str, typer.Option(help="loky: this machine; dask: a cluster.")]
+AddressOption = Annotated[
+    str | None, typer.Option(metavar="tcp://HOST:PORT", help="The Dask cluster's scheduler.")
 ]
 
 
@@ -97,30 +106,44 @@ def rig_of(recording: Recording, rig: Rig | None) -> Rig | None:
         return None
 
 
-def reading(
-    rig: Rig | None, topic: list[str] | None, stamps: str, columns: Path | None, repair_clock: bool
-) -> dict[str, Any]:
-    """The options of the command line as those of `open_recordings`."""
-    return {
-        "rig": rig,
-        "topics": parse_topics(topic),
-        "stamps": check_stamps(stamps),
-        "columns": columns,
-        "repair_clock": repair_clock,
-    }
+@dataclass(frozen=True)
+class HowRead:
+    """How logs are read: a command with a parameter of this type has these options."""
 
+    topic: TopicOption = None
+    stamps: StampsOption = "header"
+    columns: ColumnsOption = None
+    repair_clock: RepairClockOption = False
 
-def opened(names: Sequence[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
-    """The logs of some names, of which `LOG@60-105` is a segment and `LOG@/45` are all segments of 45 s."""
-    from terrafusion.datasets.core.segments import split_name
-    from terrafusion.datasets.readers import open_recordings
+    def options(self, rig: Rig | None) -> dict[str, Any]:
+        """Those of `open_recordings`; malformed ones are wrong usage (exit status 2)."""
+        return {
+            "rig": rig,
+            "topics": parse_topics(self.topic),
+            "stamps": check_stamps(self.stamps),
+            "columns": self.columns,
+            "repair_clock": self.repair_clock,
+        }
 
-    found: list[Recording] = []
-    for name in names:
-        log, cut = split_name(name)
-        for recording in open_recordings(log, **options):
-            found += [recording] if cut is None else cut.of(recording)
-    return [clock_accepted(r) for r in found] if repair_clock else found
+    def open(self, log: str, rig: Rig | None) -> Recording:
+        """The one recording of a log."""
+        from terrafusion.datasets.readers import open_recording
+
+        recording = open_recording(log, **self.options(rig))
+        return clock_accepted(recording) if self.repair_clock else recording
+
+    def open_all(self, names: Sequence[str], rig: Rig | None) -> list[Recording]:
+        """The logs of some names, of which `LOG@60-105` is a segment, `LOG@/45` all segments of 45 s."""
+        from terrafusion.datasets.core.segments import split_name
+        from terrafusion.datasets.readers import open_recordings
+
+        options = self.options(rig)
+        found: list[Recording] = []
+        for name in names:
+            log, cut = split_name(name)
+            for recording in open_recordings(log, **options):
+                found += [recording] if cut is None else cut.of(recording)
+        return [clock_accepted(r) for r in found] if self.repair_clock else found
 
 
 def clock_accepted(recording: Recording) -> Recording:
@@ -235,3 +258,22 @@ def _progress_lines(what: str) -> Callable[[float], None]:
             print(f"{what}: {share:.0%}, {left_s:.0f} s left", file=sys.stderr, flush=True)
 
     return tell
+
+
+def check_backend(backend: str, address: str | None) -> None:
+    """Refuse wrong usage of `--backend` and `--address`, before any work."""
+    from terrafusion.twin.executors import BACKENDS
+
+    if backend not in BACKENDS:
+        raise typer.BadParameter(
+            f"'{backend}' is neither {' nor '.join(map(repr, BACKENDS))}", param_hint="--backend"
+        )
+    if (address is not None) != (backend == "dask"):
+        raise typer.BadParameter("goes with --backend dask, which needs it", param_hint="--address")
+
+
+def processes(jobs: int | None) -> int:
+    """`--jobs`, or the number of processors."""
+    import joblib
+
+    return jobs if jobs is not None else int(joblib.cpu_count())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,15 +10,11 @@ import typer
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
-    ColumnsOption,
+    HowRead,
     LogArgument,
-    RepairClockOption,
-    StampsOption,
-    TopicOption,
     VehicleOption,
     clock_accepted,
     load_rig,
-    reading,
     refuse_impossible,
     rig_of,
 )
@@ -35,10 +32,7 @@ def convert(
     log: LogArgument,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A name ending in .mcap, or a folder.")],
     vehicle: VehicleOption = None,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
-    repair_clock: RepairClockOption = False,
+    how: HowRead = HowRead(),  # noqa: B008 (frozen)
     apply_fixes: Annotated[
         bool,
         typer.Option("--apply-fixes", help="Apply the repairs that `inspect` offers, and list them."),
@@ -58,18 +52,16 @@ def convert(
 
       terrafusion convert raw_log repaired_log --apply-fixes
     """
-    import dataclasses
-
     from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.readers import open_recording
 
     rig = load_rig(vehicle)
-    recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock or apply_fixes))
-    if repair_clock:
+    recording = open_recording(log, **replace(how, repair_clock=how.repair_clock or apply_fixes).options(rig))
+    if how.repair_clock:
         recording = clock_accepted(recording)
     rig = rig_of(recording, rig)
     if vehicle is not None:
-        recording = dataclasses.replace(recording, vehicle=vehicle)
+        recording = replace(recording, vehicle=vehicle)
     lines = [f"note: {note}" for note in recording.notes]
     repaired: list[Finding] = []
     if apply_fixes:

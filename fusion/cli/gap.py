@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from terrafusion.fusion.cli.calibrate import parse_terrain, split
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
-    ColumnsOption,
-    RepairClockOption,
-    StampsOption,
-    TopicOption,
+    HowRead,
     command_line,
     load_rig,
-    opened,
     progress_bar,
     read_json,
-    reading,
 )
 from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
+    from terrafusion.datasets.core.sensors import Rig
     from terrafusion.fusion.benchmark.estimator_gap import Compared
     from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
@@ -53,7 +49,7 @@ def _explained(effect: str | None) -> None:
     """Print what an effect is, and stop."""
     if effect is None:
         return
-    from terrafusion.fusion.reports.explain_effect import explanation
+    from terrafusion.fusion.reports.gap_text import explanation
 
     for line in explanation(effect):
         print(line)
@@ -96,10 +92,7 @@ def gap(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
     explain: ExplainOption = None,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
-    repair_clock: RepairClockOption = False,
+    how: HowRead = HowRead(),  # noqa: B008 (frozen)
 ) -> Result:
     """Diagnose where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
@@ -113,9 +106,8 @@ def gap(
     from terrafusion.twin.gap.diagnose import diagnose
     from terrafusion.twin.model.vehicle import load_vehicle
 
-    options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-    judged = _opened_by_name(runs, options, repair_clock)
-    normal = _opened_by_name(reference or [], options, repair_clock)
+    rig = load_rig(vehicle)
+    judged, normal = (_opened_by_name(names, how, rig) for names in (runs, reference or []))
     with progress_bar("comparing") as progress:
         found = diagnose(
             judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
@@ -133,13 +125,13 @@ def gap(
     return Result([*compared, *lines], "", document, details=more, short=short)
 
 
-def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
+def _opened_by_name(names: list[str], how: HowRead, rig: Rig | None) -> list[Recording]:
     """The logs, each called as it was given: drives of one scenario share the name in their files."""
     import dataclasses
 
     found: list[Recording] = []
     for name in names:
-        logs = opened([name], options, repair_clock)
+        logs = how.open_all([name], rig)
         called = [name] if len(logs) == 1 else [f"{name}#{i}" for i in range(len(logs))]
         found += [dataclasses.replace(log, name=own) for log, own in zip(logs, called, strict=True)]
     return found

@@ -10,9 +10,15 @@ from typing import Annotated
 import typer
 
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
+from terrafusion.fusion.cli.common import (
+    AddressOption,
+    BackendOption,
+    check_backend,
+    command_line,
+    progress_bar,
+    read_json,
+)
 from terrafusion.fusion.cli.outputs import Output
-from terrafusion.fusion.cli.workers import AddressOption, BackendOption, check_backend
 
 OUTPUT = Output(
     "Folder for blind.json, report.html and the sealed labels.",

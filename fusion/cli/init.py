@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,16 +11,11 @@ import typer
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
-    ColumnsOption,
+    HowRead,
     LogArgument,
-    RepairClockOption,
-    StampsOption,
-    TopicOption,
-    clock_accepted,
     command_line,
     parse_topics,
     progress_bar,
-    reading,
 )
 
 if TYPE_CHECKING:
@@ -59,10 +54,7 @@ def init(
     no_verdict: Annotated[
         bool, typer.Option("--no-verdict", help="Write the file only; do not replay the log with it.")
     ] = False,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
-    repair_clock: RepairClockOption = False,
+    how: HowRead = HowRead(),  # noqa: B008 (frozen)
 ) -> Result:
     """Write the vehicle file of a robot from its first log, and replay the log with it.
 
@@ -91,10 +83,10 @@ def init(
         imu_m=imu_position,
         mass_kg=mass,
     )
-    reading(None, topic, stamps, columns, repair_clock)  # reports wrong usage before anything is read
-    first_log = _FirstLog(log, stamps, columns, repair_clock)
+    how.options(None)  # reports wrong usage before anything is read
+    first_log = _FirstLog(log, how)
     with decoded_once():
-        first_log.topics = choose_sensors(log, parse_topics(topic))
+        first_log.topics = choose_sensors(log, parse_topics(how.topic))
         first = first_log.read(generic_rig())
         print_lines(contents_lines(first))
         answers = ask(answers, first_log.topics)
@@ -123,23 +115,17 @@ class _FirstLog:
     """The log and how it is read, with the topics chosen so far."""
 
     log: str
-    stamps: str
-    columns: Path | None
-    repair_clock: bool
+    how: HowRead
     topics: dict[str, str] = field(default_factory=dict)
     held: tuple[Any, Recording] | None = None
 
     def read(self, rig: Rig | None) -> Recording:
         """The recording of a robot; another reading only where the robot can change it."""
-        from terrafusion.datasets.readers import open_recording
-
         receiver = rig.sensors.gnss if rig is not None else None
         if self.held is not None and self.held[0] == receiver:
             return self.held[1]
         entries = [f"{channel}={name}" for channel, name in self.topics.items()]
-        options = reading(rig, entries, self.stamps, self.columns, self.repair_clock)
-        recording = open_recording(self.log, **options)
-        recording = clock_accepted(recording) if self.repair_clock else recording
+        recording = replace(self.how, topic=entries).open(self.log, rig)
         if not self._is_bag():  # all that the vehicle changes in other logs is the sigma of fixes without one
             self.held = receiver, recording
         return recording
@@ -154,9 +140,9 @@ class _FirstLog:
         """The options by which another command reads the log alike; the file holds most topics itself."""
         joints = {name: topic for name, topic in self.topics.items() if name.startswith("joint.")}
         words = [f"--topic {shlex.quote(f'{name}={topic}')}" for name, topic in joints.items()]
-        words += [f"--stamps {self.stamps}"] if self.stamps != "header" else []
-        words += [f"--columns {shlex.quote(str(self.columns))}"] if self.columns is not None else []
-        words += ["--repair-clock"] if self.repair_clock else []
+        words += [f"--stamps {self.how.stamps}"] if self.how.stamps != "header" else []
+        words += [f"--columns {shlex.quote(str(self.how.columns))}"] if self.how.columns is not None else []
+        words += ["--repair-clock"] if self.how.repair_clock else []
         return "".join(f" {word}" for word in words)
 
 

@@ -1,7 +1,10 @@
-"""`terrafusion inspect LOG`: contents of a log and findings of the log checks, on one page."""
+"""`terrafusion inspect LOG`: contents of a log and findings of the log checks, or single-wheel trials, on one
+page.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,15 +13,16 @@ import typer
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
+    HowRead,
     LogArgument,
     StampsOption,
     TopicOption,
     VehicleOption,
     command_line,
     load_rig,
-    reading,
     rig_of,
 )
+from terrafusion.fusion.cli.inspect_page import Line
 
 
 def inspect(
@@ -49,10 +53,9 @@ def inspect(
       terrafusion inspect my_log_folder --json
     """
     from terrafusion.fusion.cli.inspect_page import page_lines, styled_lines
-    from terrafusion.fusion.cli.single_wheel_page import trials_lines, trials_of
 
     load_rig(vehicle)
-    reading(None, topic, stamps, columns, repair_clock=True)  # reports wrong usage for any kind of log
+    HowRead(topic, stamps, columns, True).options(None)  # reports wrong usage for any kind of log
     trials = trials_of(log) if columns is None else None
     page = trials or inspected(log, vehicle, topic, stamps, columns)
     lines = list(trials_lines(page) if trials else page_lines(page))
@@ -82,7 +85,7 @@ def inspected(
     from terrafusion.datasets.readers import open_recordings
 
     rig = load_rig(vehicle)
-    recordings = open_recordings(log, **reading(rig, topic, stamps, columns, repair_clock=True))
+    recordings = open_recordings(log, **HowRead(topic, stamps, columns, True).options(rig))
     findings = [run_checks(recording, rig_of(recording, rig)) for recording in recordings]
     measures = measure(recordings, rig_of(recordings[0], rig))
     if len(recordings) == 1:
@@ -90,3 +93,52 @@ def inspected(
     names = {recording.name.rpartition("#")[0] for recording in recordings}
     name = names.pop() if len(names) == 1 else ""
     return summarise_all(name or Path(log).name, recordings, measures, findings)
+
+
+def trials_of(log: str) -> dict[str, Any] | None:
+    """Summary of the trials at `log` as plain data; None where the log has another format.
+
+    Raises:
+        TerrafusionError: the log cannot be read.
+    """
+    from terrafusion.datasets.catalog.catalog import load_catalog
+    from terrafusion.datasets.core.errors import DataError
+    from terrafusion.datasets.readers.formats import format_of
+    from terrafusion.datasets.readers.open import find_log
+    from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials
+
+    path, number = find_log(log)
+    if format_of(path).name != "single_wheel_mat":
+        return None
+    if number is not None:
+        raise DataError("trials have no numbers", file=path, remedy=f"leave #{number} out")
+    trials = read_wheel_trials(path)
+    entry = load_catalog().find(path)
+    return {
+        "name": path.stem,
+        "kind": "single-wheel trials",
+        "licence": load_catalog().sets[entry.set_name].licence if entry else None,
+        **trials.summary(),
+        "notes": list(trials.notes),
+    }
+
+
+def trials_lines(page: dict[str, Any]) -> Iterator[Line]:
+    """The page as lines of text; angles in degrees."""
+    import numpy as np
+
+    licence = f"; licence {page['licence']}" if page["licence"] else ""
+    yield "bold", f"{page['name']}  {page['trials']} trials of a single wheel{licence}"
+    yield "", f"          {page['driven']} driven, {page['braked']} braked"
+    yield "", ""
+    angles = ", ".join(f"{angle:.0f}" for angle in np.degrees(page["commanded_side_slip_rad"]))
+    yield "", f"side-slip commanded at {angles} deg"
+    for name, span in page.items():
+        if isinstance(span, tuple) and not name.startswith("commanded"):
+            low, high = np.degrees(span) if name.endswith("_rad") else span
+            unit = name.replace("_rad", "_deg")
+            yield "", f"{unit:20} {low:8.3g} to {high:.3g}"
+    for note in page["notes"]:
+        yield "dim", f"note      {note}"
+    yield "", ""
+    yield "", "read them with terrafusion.datasets.readers.sets.single_wheel.read_wheel_trials"

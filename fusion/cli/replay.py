@@ -11,18 +11,13 @@ import typer
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
-    ColumnsOption,
+    HowRead,
     LogArgument,
-    RepairClockOption,
-    StampsOption,
-    TopicOption,
     VehicleOption,
-    clock_accepted,
     command_line,
     load_rig,
     progress_bar,
     read_json,
-    reading,
     refuse_errors,
 )
 from terrafusion.fusion.cli.outputs import Output
@@ -119,10 +114,7 @@ def replay(
     magnetometer: MagnetometerOption = False,
     declination: DeclinationOption = None,
     grounds: GroundsOption = None,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
-    repair_clock: RepairClockOption = False,
+    how: HowRead = HowRead(),  # noqa: B008 (frozen)
 ) -> Result:
     """Estimate a recorded drive as it would have run live, and score it.
 
@@ -134,7 +126,6 @@ def replay(
     Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
     """
     from terrafusion.datasets.core.errors import errors_of
-    from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.grounds.file import read_grounds, save_grounds
     from terrafusion.fusion.metrics.scores import parse_outage
@@ -150,9 +141,7 @@ def replay(
     outages = [parse_outage(text) for text in gnss_outage or []]
     memory = None if grounds is None else read_grounds(grounds)
     rig = load_rig(vehicle)
-    recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
-    if repair_clock:
-        recording = clock_accepted(recording)
+    recording = how.open(log, rig)
     findings = refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(

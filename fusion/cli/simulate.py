@@ -1,4 +1,4 @@
-"""`terrafusion simulate`: one drive of the twin, written to a log."""
+"""`terrafusion simulate`: one drive of the twin, with optional effects, written to a log."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.effects import effect_values, listed
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
     from terrafusion.twin.analysis.summary import RunSummary
     from terrafusion.twin.simulate import SimulatedRun
+
 
 OUTPUT = Output(
     "Log folder, or a file ending in .mcap.", LOG_FILES, ("meta.yaml",), mark='source: "terrafusion twin"'
@@ -159,3 +160,40 @@ def _immobilised_line(summary: RunSummary) -> str:
         f"immobilised at {summary.immobilised_at_s:.1f} s, "
         f"({summary.immobilised_x_m:.1f}, {summary.immobilised_y_m:.1f}) m: {summary.immobilised_cause}"
     )
+
+
+def effect_values(words: list[str]) -> dict[str, float]:
+    """Values by name of `NAME=VALUE` words; names and ranges are checked by the twin."""
+    values: dict[str, float] = {}
+    for word in words:
+        name, equals, number = word.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise typer.BadParameter(f"'{word}' is not NAME=VALUE", param_hint="--effect")
+        if name in values:
+            raise typer.BadParameter(f"'{name}' is given twice", param_hint="--effect")
+        values[name] = value
+    return values
+
+
+def listed(words: list[str] | None) -> list[str] | None:
+    """Prints all effects and leaves where 'help' is among the words."""
+    if words and "help" in words:
+        for line in effect_lines():
+            print(line)
+        raise typer.Exit
+    return words
+
+
+def effect_lines() -> list[str]:
+    """A line a parameter: name, typical size, range, unit, equation."""
+    from terrafusion.twin.effects.catalogue import parameters
+
+    rows = [
+        (key, f"{p.scale:g}", f"{p.low:g} to {p.high:g} {p.unit}".rstrip(), form.equation)
+        for key, (form, p) in parameters().items()
+    ]
+    return text_table(("effect", "typical", "range", "equation (e is the value)"), rows)

@@ -8,15 +8,16 @@ from typing import Annotated
 import typer
 
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import progress_bar, read_json
-from terrafusion.fusion.cli.outputs import Output
-from terrafusion.fusion.cli.workers import (
+from terrafusion.fusion.cli.common import (
     AddressOption,
     BackendOption,
     JobsOption,
     check_backend,
     processes,
+    progress_bar,
+    read_json,
 )
+from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for the tables, metrics.json and report.html.",

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
-from terrafusion.fusion.cli.outputs import Output
-from terrafusion.fusion.cli.workers import (
+from terrafusion.fusion.cli.common import (
     AddressOption,
     BackendOption,
     JobsOption,
     check_backend,
+    command_line,
     processes,
+    progress_bar,
+    read_json,
 )
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.twin.sweep.plan import Sweep

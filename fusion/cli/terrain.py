@@ -13,16 +13,16 @@ import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli.command import Result, add_command
-from terrafusion.fusion.cli.common import progress_bar
-from terrafusion.fusion.cli.outputs import Output, parts_of
-from terrafusion.fusion.cli.usage import CommandGroup
-from terrafusion.fusion.cli.workers import (
+from terrafusion.fusion.cli.common import (
     AddressOption,
     BackendOption,
     JobsOption,
     check_backend,
     processes,
+    progress_bar,
 )
+from terrafusion.fusion.cli.outputs import Output, parts_of
+from terrafusion.fusion.cli.usage import CommandGroup
 
 if TYPE_CHECKING:
     from terrafusion.fusion.training.detector_scores import DetectorScores

@@ -1,21 +1,25 @@
-"""Ground memory beside a drive: recognises grounds, and learns them while fixes are good."""
+"""Ground memory beside a drive: recognises grounds, and learns them while fixes are good.
+
+A ground is learned by slip and side-slip over stretches of several metres, wheels against the estimate.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections import Counter
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Protocol
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.ground import SLIPPERY_MODELS
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.grounds.signature import SignatureExtractor
-from terrafusion.fusion.grounds.stretches import SlipStretch, StretchMeter
 from terrafusion.fusion.terrain.features import Window
 
 SURE = 0.5
@@ -24,6 +28,9 @@ USABLE = 0.1
 """Most uncertain slip of a stretch that is used."""
 CLOCKED_NS = 946_684_800_000_000_000
 """Stamps before the year 2000 are no dates."""
+LEAST_M, SIGMAS, MOST_M, MOST_S = 4.0, 20.0, 40.0, 60.0
+"""A stretch ends after 4 m and twenty sigma of the position, at most 40 m; one of 60 s is dropped."""
+MOST_SLIP = 1.0
 
 
 class FrictionBank(Protocol):
@@ -82,3 +89,54 @@ class GroundLearner:
 
 def _date(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns * 1e-9, UTC).strftime("%Y-%m-%d") if t_ns > CLOCKED_NS else ""
+
+
+@dataclass(frozen=True)
+class SlipStretch:
+    """Slip, side-slip (lateral over forward distance) and their 1 sigma."""
+
+    slip: float
+    side: float
+    sigma: float
+
+
+class StretchMeter:
+    """Sums motion of wheels and estimate; `add` gives a stretch when it is long enough."""
+
+    def __init__(self) -> None:
+        self._before: State | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._seconds = self._rolled_m = self._path_m = self._along_m = self._across_m = 0.0
+
+    def restart(self) -> None:
+        """The motion was interrupted, or fixes are missing."""
+        self._before = None
+        self._begin()
+
+    def add(self, state: State, rolled_m: float) -> SlipStretch | None:
+        """The motion up to `state`, in which the wheels rolled `rolled_m`."""
+        before, self._before = self._before, state
+        if before is None or not math.isfinite(rolled_m):
+            self._begin()
+            return None
+        turned = quaternion_to_matrix(before.quaternion) + quaternion_to_matrix(state.quaternion)
+        moved = state.position_m - before.position_m
+        forward, left = turned[:, 0], turned[:, 1]
+        self._along_m += float(moved @ forward) / math.sqrt(float(forward @ forward))
+        self._across_m += float(moved @ left) / math.sqrt(float(left @ left))
+        self._rolled_m += rolled_m
+        self._path_m += abs(rolled_m)
+        self._seconds += (state.t_ns - before.t_ns) * 1e-9
+        sigma_m = math.sqrt(0.5 * float(state.covariance[0, 0] + state.covariance[1, 1]))
+        if abs(self._rolled_m) < min(max(LEAST_M, SIGMAS * sigma_m), MOST_M):
+            if self._seconds > MOST_S:
+                self._begin()
+            return None
+        slip, side = 1.0 - self._along_m / self._rolled_m, self._across_m / self._path_m
+        sigma = math.sqrt(2.0) * sigma_m / abs(self._rolled_m)
+        self._begin()
+        if abs(slip) > MOST_SLIP or abs(side) > MOST_SLIP:
+            return None
+        return SlipStretch(slip, side, sigma)

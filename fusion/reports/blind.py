@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_png
 from terrafusion.fusion.reports.plots import blind as plots
 
@@ -85,8 +86,6 @@ def summary(scores: Scores) -> list[str]:
          MET[row["diagnosis"]["met"]]]
         for row in scores["headline"]
     ]  # fmt: skip
-    table = [["", *methods, "target", ""], *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    lines = ["  ".join(f"{cell:{w}s}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in table]
+    lines = text_table(["", *methods, "target", ""], rows)
     count = f"{scores['trials']} of {scores.get('planned', scores['trials'])}"
     return [f"{count} trials of plant {plots.plant_name(scores)}; crashes: {crashes}", *lines]

@@ -16,11 +16,11 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of
 from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
-from terrafusion.fusion.training.change_alarm import precision_of
 from terrafusion.fusion.training.softmax import (
     UNKNOWN_SHARE,
     SoftmaxModel,
     fit_softmax,
+    precision_of,
 )
 from terrafusion.fusion.training.surface_features import (
     SURFACE_FEATURES,

@@ -3,6 +3,10 @@
 Multinomial logistic regression, fitted by scikit-learn, evaluated here without it. Cross-validated by run it
 is better than a forest on BorealTC (docs/explanation/terrain.md). Missing features count as the training
 mean; training on copies of the windows without whole feature groups keeps it calibrated then.
+
+A change of ground raises an alarm: the classes' log-odds of the last second differ from their mean over the
+seconds before by more than they do along runs on one ground (Hotelling's T^2 per degree of freedom). Unlike
+probabilities, log-odds do not saturate: a change shows although the new ground is taken for a wrong class.
 """
 
 from __future__ import annotations
@@ -21,7 +25,6 @@ from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.training.change_alarm import has_changed
 from terrafusion.fusion.training.surface_features import (
     GROUPS,
     HOP_S,
@@ -43,6 +46,13 @@ UNKNOWN_SHARE = 0.05
 """Share of windows of known ground that may be classified as unknown (split conformal, Vovk et al. 2005)."""
 _NUMBERS = ("mean", "scale", "weights", "offsets", "centres", "precision", "alarm")
 _PLAIN = ("schema", "made_by", "inputs", "features", "classes", "temperature", "odd_distance")
+ALARM_MEMORY, ALARM_LEAST = 6, 3
+"""Windows before, at most and at least, that the newest is compared with."""
+ALARM_OVERLAP = 1
+"""Windows just before the newest that share samples with it, and are left out."""
+ALARM_LIMIT = 5.0
+"""T^2 per degree of freedom of an alarm (chosen on routes spliced from BorealTC)."""
+_ALARM_SHRINK = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,3 +245,30 @@ def _with_gaps(z: Array, y: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
 
 def _digits(x: Any) -> Any:
     return [_digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")
+
+
+def precision_of(drives: Sequence[Array]) -> Array:
+    """Inverse scatter (k, k) of the differences along drives on one ground, each with log-odds (n, k)."""
+    away = [
+        odds[i] - _before(odds[: i + 1]).mean(axis=0)
+        for odds in drives
+        for i in range(ALARM_MEMORY + ALARM_OVERLAP + 1, len(odds), 2)
+    ]
+    k = drives[0].shape[1]
+    if len(away) < 2 * k:
+        return np.zeros((k, k))
+    scatter = np.cov(np.array(away).T)
+    return np.asarray(np.linalg.pinv(scatter + _ALARM_SHRINK * np.trace(scatter) / k * np.eye(k)))
+
+
+def has_changed(odds: Array, precision: Array) -> bool:
+    """Whether the ground of the last of the log-odds (n, k), all since the last alarm, is a new one."""
+    before = _before(odds)
+    if len(before) < ALARM_LEAST:
+        return False
+    away = odds[-1] - before.mean(axis=0)
+    return float(away @ precision @ away) > ALARM_LIMIT * (odds.shape[1] - 1)
+
+
+def _before(odds: Array) -> Array:
+    return odds[max(len(odds) - 1 - ALARM_OVERLAP - ALARM_MEMORY, 0) : max(len(odds) - 1 - ALARM_OVERLAP, 0)]

@@ -1,9 +1,9 @@
 """The least-squares problem: residuals of all logs and windows, and its normal equations.
 
-Unknown are the parameters (as `coordinates.Coordinate`), constant errors of the sensors of each log, and the
-pose at the start of each window. All have Gaussian priors and are scaled by their prior sigma, so that the
-normal matrix is never singular. The poses are eliminated window by window (Schur complement), which
-marginalises them.
+Unknown are the parameters (as `coordinates.Coordinate`), constant errors of the sensors of each log (offsets
+and gains: otherwise a current sensor that is 2 % off would pass for a heavier robot), and the pose at the
+start of each window. All have Gaussian priors and are scaled by their prior sigma, so that the normal matrix
+is never singular. The poses are eliminated window by window (Schur complement), which marginalises them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.predict import POSE, predict
-from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
+from terrafusion.twin.model.vehicle import VehicleParams
 
 POSE_SIGMA = np.array([10.0, 10.0, 1.0])
 """1 sigma of a window's start about its guess (assumed, m and rad): wide, as the log determines it."""
@@ -34,6 +34,10 @@ Key = tuple[int, int]
 """Log and channel, by number."""
 NoiseModel = dict[Key, ResidualNoise]
 """Noise of each log's channels."""
+GYRO_OFFSET_RADPS, ACCEL_OFFSET_MPS2 = 0.02, 0.5
+"""1 sigma of the offsets of an IMU (assumed): a warm MEMS gyro; an accelerometer tilted by 3 deg."""
+LEAST_GAIN, LEAST_CURRENT_OFFSET_A = 1e-3, 0.02
+"""Least 1 sigma of a gain and of a current sensor's offset (assumed)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,3 +232,36 @@ class Problem:
     def seconds(self) -> float:
         """Length of all logs, s."""
         return sum(float(np.diff(log.windows, axis=1).sum()) * DT_S for log in self.logs)
+
+
+@dataclass(frozen=True)
+class SensorError:
+    """Gain or offset of one channel, reading = (1 + gain) true + offset, with its prior 1 sigma."""
+
+    channel: str
+    kind: str
+    sigma: float
+
+    @property
+    def name(self) -> str:
+        """Channel and kind."""
+        return f"{self.channel} {self.kind}"
+
+
+def sensor_errors(vehicle: VehicleParams) -> tuple[SensorError, ...]:
+    """The errors of all channels, always in the same order."""
+    imu, current = vehicle.realism.imu, vehicle.realism.current
+    gyro, accel = max(imu.gyro_scale_sigma, LEAST_GAIN), max(imu.accel_scale_sigma, LEAST_GAIN)
+    offset, gain = max(current.offset_sigma_a, LEAST_CURRENT_OFFSET_A), max(current.gain_sigma, LEAST_GAIN)
+    found = [
+        ("yaw_rate_radps", GYRO_OFFSET_RADPS, gyro),
+        ("accel_x_mps2", ACCEL_OFFSET_MPS2, accel),
+        ("accel_y_mps2", ACCEL_OFFSET_MPS2, accel),
+        ("current_left_a", offset, gain),
+        ("current_right_a", offset, gain),
+    ]
+    return tuple(
+        SensorError(channel, kind, sigma)
+        for channel, *sigmas in found
+        for kind, sigma in zip(("offset", "gain"), sigmas, strict=True)
+    )

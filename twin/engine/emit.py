@@ -18,11 +18,14 @@ from terrafusion.twin.engine.graph import (
     BINARY,
     CONST,
     INPUT,
+    WHEELS,
+    Atom,
+    LaneOf,
     OperationGraph,
     Outputs,
     UnsupportedOperationError,
+    packs,
 )
-from terrafusion.twin.engine.packing import WHEELS, Atom, LaneOf, packs
 
 _LATENCY = {"sqrt": 21, "div": 13, "exp": 70, "log": 80, "sin": 60, "cos": 60}
 _LATENCY_ELSE = 4

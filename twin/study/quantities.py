@@ -17,8 +17,7 @@ from terrafusion.twin.study.batch import (
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.field_drive import FieldDrive, field_measures
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, least_ratio
-from terrafusion.twin.study.published import CASES, FRICTION
-from terrafusion.twin.study.robot import platform_figures
+from terrafusion.twin.study.published import CASES, FRICTION, platform_figures
 from terrafusion.twin.study.spread import Spread, spread
 
 Runs = Mapping[str, Sequence[CaseRun]]

@@ -1,18 +1,21 @@
-"""Trials of one wheel in a test bed: forces, sinkage, slip and side-slip, mean and spread of each trial."""
+"""Trials of one wheel in a test bed (CMU, MATLAB v5): forces, sinkage, slip and side-slip, mean and spread of
+each trial. They are recognised as a log, but are no recording.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.sets.matlab_v5 import read_structures
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.sets.matlab_v5 import is_v5, read_structures, structures_with
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -164,3 +167,22 @@ def _checked_slip(slip: Array, travel_mps: Array, rim_mps: Array) -> tuple[str, 
         return ()
     wrong = int((off > SLIP_TOLERANCE).sum())
     return (f"slip: off the speeds by up to {off.max():.2f}, in {wrong} of {len(off)} trials",)
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether it is a MATLAB v5 file with the trials' fields."""
+    return is_v5(head) and structures_with(path, FIELDS)
+
+
+def read(request: Request) -> NoReturn:
+    """Refuse, with the function that reads it.
+
+    Raises:
+        DataError: always.
+    """
+    trials = read_wheel_trials(request.path)
+    raise DataError(
+        f"holds {len(trials)} trials of a single wheel, not a drive",
+        file=request.path,
+        remedy="`terrafusion inspect` sums them up; in Python, single_wheel.read_wheel_trials reads them",
+    )

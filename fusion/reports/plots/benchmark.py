@@ -25,7 +25,7 @@ def plot_ratios(contrasts: Sequence[Contrast]) -> Figure:
     shown = [c for c in contrasts if c.arm != BASELINE]
     groups = list(dict.fromkeys((c.family, c.plant) for c in shown))
     arms = list(dict.fromkeys(c.arm for c in shown))
-    fig, ax = style.canvas(None, (9.0, 1.3 + GROUP_IN * len(groups)))
+    fig, ax = style.canvas((9.0, 1.3 + GROUP_IN * len(groups)))
     for k, arm in enumerate(arms):
         own = [c for c in shown if c.arm == arm]
         height = [groups.index((c.family, c.plant)) + SPREAD * (k - 0.5 * (len(arms) - 1)) for c in own]

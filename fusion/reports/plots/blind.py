@@ -33,9 +33,8 @@ def plant_name(scores: Scores) -> str:
     return str(scores.get("plant_sha256", "unknown"))[:12]
 
 
-def plot_power(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_power(scores: Scores, ax: Axes) -> None:
     """Share detected over d' of the oracle, one line a method and form."""
-    fig, ax = style.canvas(ax, (6.0, 4.0))
     shift = 0.97
     for method, figures in scores["figures"].items():
         for family, dash in DASHES.items():
@@ -50,12 +49,10 @@ def plot_power(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
     ax.set_ylim(-0.03, 1.05)
     ax.legend(fontsize=7, frameon=False, loc="lower right")
     style.format_axes(ax, x="d' of the oracle", y="share detected", title="Detected")
-    return fig, ax
 
 
-def plot_alarms(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_alarms(scores: Scores, ax: Axes) -> None:
     """False alarms by setting."""
-    fig, ax = style.canvas(ax, (6.0, 4.0))
     names = list(scores["figures"]["diagnosis"]["false_alarms"])
     for k, (method, figures) in enumerate(scores["figures"].items()):
         rates, at = list(figures["false_alarms"].values()), np.arange(len(names)) + 0.2 * k
@@ -65,12 +62,10 @@ def plot_alarms(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
     style.format_axes(ax, y="share of trials without effect", title="False alarms (dotted: target)")
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right")
     ax.tick_params(axis="x", labelsize=7)
-    return fig, ax
 
 
-def plot_named(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_named(scores: Scores, ax: Axes) -> None:
     """Share of detected trials whose truth is named."""
-    fig, ax = style.canvas(ax, (6.0, 4.0))
     labels = [f"{label}\n{family}" for label in NAMED.values() for family in DASHES]
     for k, (method, figures) in enumerate(scores["figures"].items()):
         rates = [figures[name][family] for name in NAMED for family in DASHES]
@@ -80,12 +75,10 @@ def plot_named(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
     style.format_axes(ax, y="share of detected trials", title="Named")
     ax.set_xticks(range(len(labels)), labels)
     ax.tick_params(axis="x", labelsize=7)
-    return fig, ax
 
 
-def plot_reliability(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_reliability(scores: Scores, ax: Axes) -> None:
     """Share that was right over stated confidence of the diagnosis, dots as large as their count."""
-    fig, ax = style.canvas(ax, (6.0, 4.0))
     ax.plot([0, 1], [0, 1], color=style.NEUTRAL, linewidth=0.8)
     for family, dash in DASHES.items():
         confidence = scores["figures"]["diagnosis"]["confidence"][family]
@@ -101,7 +94,6 @@ def plot_reliability(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Ax
         ax.legend(fontsize=7, frameon=False, loc="lower right")
     x, y = "stated confidence of the first class", "share that was right"
     style.format_axes(ax, x=x, y=y, title="Confidence")
-    return fig, ax
 
 
 def plot_confusion(table: Mapping[str, Mapping[str, int]]) -> Figure:
@@ -110,7 +102,7 @@ def plot_confusion(table: Mapping[str, Mapping[str, int]]) -> Figure:
     columns = [name for name in rows if name in answers] + sorted(answers - set(rows))
     values = np.array([[table[row].get(column, 0) for column in columns] for row in rows], dtype=float)
     share = values / np.maximum(values.sum(axis=1, keepdims=True), 1.0)
-    fig, ax = style.canvas(None, (2.5 + 0.24 * len(columns), 2.2 + 0.2 * len(rows)))
+    fig, ax = style.canvas((2.5 + 0.24 * len(columns), 2.2 + 0.2 * len(rows)))
     ax.imshow(share, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
     for (i, j), count in np.ndenumerate(values):
         if count:

@@ -19,7 +19,7 @@ PRIOR = "#d0d0d0"
 def plot_parameters(calibration: Calibration) -> Figure:
     """Each parameter in prior sigmas about its prior, with two sigma; hollow where not identified."""
     fitted = calibration.fitted
-    fig, ax = style.canvas(None, (8.0, 0.9 + 0.36 * len(fitted)))
+    fig, ax = style.canvas((8.0, 0.9 + 0.36 * len(fitted)))
     rows = np.arange(len(fitted))[::-1]
     ax.barh(rows, 4.0, left=-2.0, height=0.5, color=PRIOR)
     for row, f in zip(rows, fitted, strict=True):
@@ -37,7 +37,7 @@ def plot_correlation(calibration: Calibration) -> Figure:
     """Correlation matrix with its numbers."""
     names = [f.name.rpartition(".")[2] for f in calibration.fitted]
     size = 2.2 + 0.55 * len(names)
-    fig, ax = style.canvas(None, (size + 1.2, size))
+    fig, ax = style.canvas((size + 1.2, size))
     ax.imshow(calibration.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
     for (i, j), value in np.ndenumerate(calibration.correlation):
         colour = "white" if abs(value) > 0.6 else "black"

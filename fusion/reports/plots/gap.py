@@ -31,7 +31,7 @@ def plot_map(d: GapDiagnosis) -> Figure:
     channels = list(dict.fromkeys(c.channel for c in d.where))
     columns = [(r, b) for r, _ in REGIMES for b in BANDS]
     share = np.full((len(channels), len(columns)), np.nan)
-    fig, ax = style.canvas(None, (10.0, 2.6 + 0.36 * len(channels)))
+    fig, ax = style.canvas((10.0, 2.6 + 0.36 * len(channels)))
     for cell in d.where:
         row, column = channels.index(cell.channel), columns.index((cell.regime, cell.band))
         share[row, column] = 100.0 * cell.share
@@ -48,7 +48,7 @@ def plot_map(d: GapDiagnosis) -> Figure:
 def plot_causes(d: GapDiagnosis) -> Figure:
     """Share of the gap that each of the first causes explains by itself; its probability beside it."""
     causes = [c for c in d.verdict.causes if c.share is not None][:MOST_CAUSES]
-    fig, ax = style.canvas(None, (8.0, 1.0 + 0.32 * len(causes)))
+    fig, ax = style.canvas((8.0, 1.0 + 0.32 * len(causes)))
     alike = {name for s in d.verdict.sets if s.named for name in s.effects}
     at = np.arange(len(causes))[::-1]
     shares = [100.0 * float(np.clip(c.share or 0.0, 0.0, 1.0)) for c in causes]
@@ -126,7 +126,7 @@ def _positions(d: GapDiagnosis, run: WhitenedRun, t_s: Array) -> Array:
 def plot_shrink(d: GapDiagnosis) -> Figure:
     """Error of every channel before and after, and in the references, in sigmas and in its unit."""
     names, rows = list(d.shrinkage.channels), list(d.shrinkage.channels.values())
-    fig, ax = style.canvas(None, (9.0, 1.2 + 0.42 * len(names)))
+    fig, ax = style.canvas((9.0, 1.2 + 0.42 * len(names)))
     at = np.arange(len(names))[::-1]
     for shift, colour, label, k in ((0.2, style.BEFORE, "before", 0), (-0.2, style.AFTER, "after", 1)):
         ax.barh(at + shift, [row[k] or 0.0 for row in rows], height=0.38, color=colour, label=label)

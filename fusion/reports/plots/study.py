@@ -100,7 +100,7 @@ def plot_gnss_speeds(runs: Mapping[str, CaseRun], noisy: Mapping[str, NoisyRun],
 
 def plot_noise(fits: Sequence[NoiseFit]) -> Figure:
     """Size of white position noise that gives the study's GNSS errors, over the rate of the positions."""
-    fig, ax = style.canvas(None, (9.0, 3.2))
+    fig, ax = style.canvas((9.0, 3.2))
     rates = [fit.rate_hz for fit in fits]
     for case, marker in zip(CASES, MARKERS, strict=False):
         sigmas = [100.0 * fit.alone_m[case.terrain] for fit in fits]
@@ -152,7 +152,7 @@ def plot_energy(batch: Sequence[BatchResult], over_slip: Sequence[BatchResult]) 
 
 def plot_tab4(runs: Mapping[str, Sequence[CaseRun]], gaussian: Mapping[str, Sequence[float]]) -> Figure:
     """Tab. 4: each single run, the mean with its interval, and the study's number; logarithmic."""
-    fig, ax = style.canvas(None, (9.0, 3.6))
+    fig, ax = style.canvas((9.0, 3.6))
     place, ticks = 0.0, list[tuple[float, str]]()
     for case in CASES:
         errors = [run.errors for run in runs[case.terrain]]

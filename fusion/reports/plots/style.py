@@ -74,10 +74,8 @@ def terrain_colour(name: object) -> str:
     return colour_of(str(name), TERRAIN_COLOURS)
 
 
-def canvas(ax: Axes | None = None, size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:
-    """`ax` and its figure, or new ones; pyplot's list of figures is not touched."""
-    if ax is not None:
-        return ax.get_figure(root=True), ax  # type: ignore[return-value]
+def canvas(size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:
+    """A new figure of `size`, inches, and its axes; pyplot's list of figures is not touched."""
     fig, axes = canvases(1, size)
     return fig, axes[0]
 
@@ -148,11 +146,11 @@ def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:
         ax.axvspan(outage.start_s, end, color=OUTAGE, zorder=0, linewidth=0, label=label)
 
 
-def plain_log_ticks(axis: Axis, subs: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+def plain_log_ticks(axis: Axis) -> None:
     """Ticks of a logarithmic axis as 200 instead of 2 x 10^2."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -176,14 +174,14 @@ def seconds(t_ns: NDArray[np.int64], start_ns: int) -> Array:
     return np.asarray((t_ns - start_ns) * 1e-9)
 
 
-def robust_limits(values: Array, *, include: Sequence[float] = (), pad: float = 0.08) -> tuple[float, float]:
+def robust_limits(values: Array, *, include: Sequence[float] = ()) -> tuple[float, float]:
     """Limits that show all but the most extreme 0.5 % at each end."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return -1.0, 1.0
     low, high = np.percentile(finite, [0.5, 99.5])
     low, high = min([low, *include]), max([high, *include])
-    room = pad * (high - low) or 0.1 * max(abs(high), 1e-6)
+    room = 0.08 * (high - low) or 0.1 * max(abs(high), 1e-6)
     return float(low - room), float(high + room)
 
 

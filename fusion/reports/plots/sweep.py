@@ -84,7 +84,7 @@ def plot_mobility(columns: Columns, plane: tuple[str, str]) -> Figure:
     """The limit of mobility of each terrain and payload: the line on which half of the runs are mobile."""
     from matplotlib.lines import Line2D
 
-    fig, ax = style.canvas(None, (7.5, 4.5))
+    fig, ax = style.canvas((7.5, 4.5))
     x, y = CellAxis.of(columns[plane[0]]), CellAxis.of(columns[plane[1]])
     handles = []
     for (terrain, payload), rows in _groups(columns, plane):
@@ -109,7 +109,7 @@ def plot_mobility(columns: Columns, plane: tuple[str, str]) -> Figure:
 
 def plot_energy_slip(columns: Columns) -> Figure:
     """Energy per metre against mean slip of the mobile runs, coloured by slope, else by terrain."""
-    fig, ax = style.canvas(None, (7.5, 4.5))
+    fig, ax = style.canvas((7.5, 4.5))
     good = select(columns, (columns["status"] == "done") & np.isfinite(columns["energy_per_m_j"]))
     slip, slope = 100.0 * good["mean_slip_ratio"], good["slope_deg"]
     sloped = len(levels(slope)) > 1

@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
-from terrafusion.fusion.reports.explain_effect import effect_words
+from terrafusion.fusion.reports.gap_text import effect_words
 from tests.twin.gap.runs import runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))

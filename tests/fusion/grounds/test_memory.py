@@ -13,9 +13,9 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.file import load_grounds, save_grounds
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
+from terrafusion.fusion.grounds.learner import StretchMeter
 from terrafusion.fusion.grounds.memory import DWELL, GroundMemory, merged
 from terrafusion.fusion.grounds.signature import SIGNATURE, VIBRATION, SignatureExtractor
-from terrafusion.fusion.grounds.stretches import StretchMeter
 from terrafusion.fusion.terrain.features import Window
 
 SMOOTH, ROUGH = 1.2, 2.0

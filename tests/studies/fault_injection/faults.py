@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.log import window_starts
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.window_starts import window_starts
 from terrafusion.twin.model.vehicle import VehicleParams, with_overrides
 
 Array = NDArray[np.float64]

@@ -14,10 +14,9 @@ import pytest
 from terrafusion.twin.engine import codegen, compiler, native
 from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.emit import Emitter
-from terrafusion.twin.engine.graph import CONST, UnsupportedOperationError, read
+from terrafusion.twin.engine.graph import CONST, UnsupportedOperationError, packs, read
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
-from terrafusion.twin.engine.packing import packs
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector

@@ -180,7 +180,7 @@ def test_waypoints_are_reached() -> None:
 
 
 def test_many_runs_drive_as_one() -> None:
-    from terrafusion.twin.sweep.batch import drive_many
+    from terrafusion.twin.sweep.rows import drive_many
 
     setups = [set_up(bend(0.5, k, 3.0), vehicle=steered("ackermann")) for k in (0.1, 0.4)]
     for setup, driven in zip(setups, drive_many(setups), strict=True):

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.cli.effects import effect_lines, effect_values
 from terrafusion.fusion.cli.main import app
+from terrafusion.fusion.cli.simulate import effect_lines, effect_values
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, Parameter, one
 from terrafusion.twin.model.ground import Variation, under_wheels

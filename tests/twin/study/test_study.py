@@ -14,8 +14,7 @@ from terrafusion.twin.simulate import simulate
 from terrafusion.twin.study import measures
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
-from terrafusion.twin.study.published import CASES
-from terrafusion.twin.study.robot import platform_figures
+from terrafusion.twin.study.published import CASES, platform_figures
 from terrafusion.twin.study.spread import spread
 
 MUD, LOOSE, MEDIUM = CASES

@@ -12,7 +12,6 @@ import pytest
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.sweep import batch
 from terrafusion.twin.sweep import rows as rows_module
 from terrafusion.twin.sweep.load import load_sweep
 from terrafusion.twin.sweep.plan import Sweep
@@ -130,9 +129,9 @@ def test_a_run_that_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: py
             motions[1][100:] = np.nan
         return motions
 
-    original_setup, original = rows_module.set_up, batch.integrate_many
+    original_setup, original = rows_module.set_up, rows_module.integrate_many
     monkeypatch.setattr(rows_module, "set_up", no_setup_at_6_deg)
-    monkeypatch.setattr(batch, "integrate_many", second_diverges)
+    monkeypatch.setattr(rows_module, "integrate_many", second_diverges)
     found = all_rows(sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 6, 5, 4]}"))
     assert [row["status"] for row in found] == [DONE, FAILED, FAILED, DONE]
     assert found[1]["error"] == "ZeroDivisionError: float division by zero"
@@ -150,7 +149,7 @@ def test_where_driving_together_fails_each_run_is_driven_alone(
 
     sweep = sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 5]}")
     together = all_rows(sweep)
-    monkeypatch.setattr(batch, "integrate_many", out_of_memory)
+    monkeypatch.setattr(rows_module, "integrate_many", out_of_memory)
     assert all_rows(sweep) == together
 
 
@@ -164,7 +163,7 @@ def test_runs_side_by_side_are_the_runs_one_by_one(scenario: str, tmp_path: Path
     sweep = load_sweep(tmp_path / "own.yaml")
     sweep = dataclasses.replace(sweep, scenario=dataclasses.replace(sweep.scenario, duration_s=12.0))
     setups = [set_up(**arguments(sweep, case)) for case in sweep.cases()]
-    for setup, found in zip(setups, batch.drive_many(setups), strict=True):
+    for setup, found in zip(setups, rows_module.drive_many(setups), strict=True):
         assert isinstance(found, DrivenStates)
         alone = setup.drive()
         np.testing.assert_array_equal(found.commanded, alone.commanded)

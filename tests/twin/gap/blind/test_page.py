@@ -11,6 +11,7 @@ import pytest
 
 from terrafusion.fusion.reports.blind import summary, write_blind
 from terrafusion.fusion.reports.plots import blind as plots
+from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.gap.blind.plan import FULL, CheckSize, plan
 from terrafusion.twin.gap.blind.score import score
 from tests.twin.gap.blind import blind_answers as fake
@@ -44,7 +45,8 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
         "false alarms, same drives" in line and "0 of 200" in line and "200 of 200" in line for line in told
     )
     assert sum(line.endswith("met") for line in told) >= 12
-    _, ax = plots.plot_power(scores)
+    _, ax = style.canvas()
+    plots.plot_power(scores, ax)
     assert len(ax.containers) == 4  # two methods, two forms
 
 
