@@ -68,6 +68,16 @@ Force = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """Values of the shared options that a command has."""
+
+    quiet: bool
+    verbose: bool
+    as_json: bool = False
+    force: bool = False
+
+
 def add_command(
     app: typer.Typer,
     name: str,
@@ -105,32 +115,24 @@ def add_command(
 
     @functools.wraps(body)
     def command(context: typer.Context, **given: Any) -> None:
-        how = {word: given.pop(word) for word in shared}
-        PROGRESS.bar, PROGRESS.lines = not how["quiet"], how["verbose"]
+        how = _Shared(**{word: given.pop(word) for word in shared})
+        PROGRESS.bar, PROGRESS.lines = not how.quiet, how.verbose
         called = context.command_path.partition(" ")[2]
         kind = instead[1] if instead is not None and given[instead[0]] else output
         if kind is not None:
-            given["out"] = kind.place(given["out"], called, subject_of(given[next(iter(own))]), how["force"])
+            given["out"] = kind.place(given["out"], called, subject_of(given[next(iter(own))]), how.force)
         for option, mark in (files or {}).items():
             if given[option] is not None:
-                check_file(given[option], how["force"], mark)
-        if how["verbose"]:
+                check_file(given[option], how.force, mark)
+        if how.verbose:
             print("\n".join(f"{key} = {value}" for key, value in given.items()), file=sys.stderr)
-        try:
-            with _told(how["quiet"], how.get("as_json", False)):
-                result = body(**_gathered(given, how_read))
-                if kind is not None and "config.json" in kind.names:
-                    from terrafusion.fusion.cli.used_config import write_config
+        with _ending_reported(given.get("out"), kind, how.verbose), _redirected(how.quiet, how.as_json):
+            result = body(**_gathered(given, how_read))
+            if kind is not None and "config.json" in kind.names:
+                from terrafusion.fusion.cli.used_config import write_config
 
-                    write_config(given["out"], called, given, result.vehicle)
-        except BaseException as error:
-            if is_interrupt(error):
-                print(f"error: {interrupted(given.get('out'), kind)}", file=sys.stderr)
-                sys.exit(INTERRUPTED)
-            if how["verbose"] and isinstance(error, TerrafusionError):
-                traceback.print_exc()
-            raise
-        show(result, how["quiet"], how["verbose"], how.get("as_json", False))
+                write_config(given["out"], called, given, result.vehicle)
+        show(result, how.quiet, how.verbose, how.as_json)
         if result.status:
             raise typer.Exit(result.status)
 
@@ -164,7 +166,21 @@ def _gathered(given: Mapping[str, Any], how_read: str | None) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _told(quiet: bool, as_json: bool) -> Iterator[None]:
+def _ending_reported(out: Path | None, kind: Output | None, verbose: bool) -> Iterator[None]:
+    """Say what an interrupted command leaves, and with `--verbose` where a known error arose."""
+    try:
+        yield
+    except BaseException as error:
+        if is_interrupt(error):
+            print(f"error: {interrupted(out, kind)}", file=sys.stderr)
+            sys.exit(INTERRUPTED)
+        if verbose and isinstance(error, TerrafusionError):
+            traceback.print_exc()
+        raise
+
+
+@contextlib.contextmanager
+def _redirected(quiet: bool, as_json: bool) -> Iterator[None]:
     """Send what is printed during the work to nowhere, or to standard error, as the options ask."""
     if not (quiet or as_json):
         yield

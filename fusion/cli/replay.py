@@ -198,8 +198,8 @@ def _write_bag(result: ReplayResult, path: Path) -> list[str]:
 def assumed_and_noted(result: ReplayResult, warnings: Sequence[str]) -> list[str]:
     """What the run assumed and noted, and the warnings of the log checks that the verdict does not name."""
     notes = dict.fromkeys((*result.estimate.notes, *result.scores.notes))
-    told = " ".join(result.verdict.reasons).lower()
-    warned = [warning for warning in warnings if warning.lower() not in told]
+    reasons = " ".join(result.verdict.reasons).lower()
+    warned = [warning for warning in warnings if warning.lower() not in reasons]
     assumed = [str(one) for one in result.assumed]
     others = [f"note: {note}" for note in notes if note not in assumed]
     return [*(f"assumed: {one}" for one in assumed), *warned, *others]

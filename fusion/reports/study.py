@@ -22,9 +22,8 @@ from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_te
 from terrafusion.fusion.reports.plots import study as plots
 from terrafusion.fusion.reports.plots import study_field as field_plots
 from terrafusion.twin.study.batch import BatchResult
-from terrafusion.twin.study.cases import SCENARIO, VEHICLE
 from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
-from terrafusion.twin.study.published import CASES, FRICTION, TITLE, platform_figures
+from terrafusion.twin.study.published import CASES, FRICTION, SCENARIO, TITLE, VEHICLE, platform_figures
 from terrafusion.twin.study.study import Study, StudyPlan
 from terrafusion.twin.study.text import (
     ASSUMED_HEAD,

@@ -15,10 +15,8 @@ from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.study.published import StudyCase
+from terrafusion.twin.study.published import SCENARIO, VEHICLE, StudyCase
 
-SCENARIO = "paper_profile"  # v(t) = 1.0 + 0.5 sin(2 pi t / 60) m/s for 300 s with short stops
-VEHICLE = "elevate"
 UNEVEN = Variation(strength_sigma=0.2, length_m=0.5)
 """Ground on which left and right wheels differ. Assumed: the study's ground was even, its contacts were not.
 Strengths of natural soils vary by 10 to 50 % (Phoon and Kulhawy 1999); the length is about the track."""

@@ -21,7 +21,8 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study.cases import UNEVEN, VEHICLE
+from terrafusion.twin.study.cases import UNEVEN
+from terrafusion.twin.study.published import VEHICLE
 
 FIELD_DRIVE = Scenario(
     name="field_sand",

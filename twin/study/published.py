@@ -13,8 +13,9 @@ import numpy as np
 
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.study.cases import SCENARIO, VEHICLE
 
+SCENARIO = "paper_profile"  # v(t) = 1.0 + 0.5 sin(2 pi t / 60) m/s for 300 s with short stops
+VEHICLE = "elevate"
 TITLE = "Evaluation of Wheeled Robot Mobility Limits on Unstructured Terrain"
 _RPM = 30.0 / math.pi
 
