@@ -29,7 +29,7 @@ OUTPUT = Output(
 
 def benchmark(
     out: Path,
-    quick: Annotated[bool, typer.Option("--quick", help="Few runs: two minutes on two processors.")] = False,
+    quick: bool = False,
     jobs: JobsOption = None,
     backend: BackendOption = "loky",
     address: AddressOption = None,
@@ -37,16 +37,8 @@ def benchmark(
         int | None,
         typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False),
     ] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="FAMILY[=SEEDS]", help="mixed, slopes, outages, firm, unseen, field; repeat for more."
-        ),
-    ] = None,
-    docs: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Put the tables into a document that has the mark line."),
-    ] = None,
+    only: list[str] | None = None,
+    docs: Path | None = None,
 ) -> Result:
     """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.
 
@@ -54,6 +46,11 @@ def benchmark(
     adversarial ground labels. Writes benchmark.json, benchmark.md, ratios.png and report.html.
 
     Example: terrafusion benchmark --out results --quick
+
+    Args:
+        quick: Few runs: two minutes on two processors.
+        only (FAMILY[=SEEDS]): mixed, slopes, outages, firm, unseen, field; repeat for more.
+        docs (FILE): Put the tables into a document that has the mark line.
     """
     from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark

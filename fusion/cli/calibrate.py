@@ -36,56 +36,29 @@ OUTPUT = Output(
     ("calibration.json",),
 )
 SENSORS_OUTPUT = Output("A vehicle file.", suffix=".yaml", mark="known: calibrated")
-TerrainOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--terrain", metavar="SOIL|LABEL=SOIL",
-        help="Soil of all logs, by name or YAML file; or of one label (repeat). Default: the logs' labels.",
-    ),
-]  # fmt: skip
-PriorOption = Annotated[
-    list[str] | None,
-    typer.Option("--prior", metavar="NAME=VALUE+-SIGMA", help="Prior of a parameter; repeat for more."),
-]
 
 
 def calibrate(
     logs: LogsArgument,
     out: Path,
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            help="Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs'."
-        ),
-    ] = None,
-    sensors: Annotated[
-        bool,
-        typer.Option(
-            "--sensors",
-            help="Learn antenna, gyro, wheel scale and delays from fixes, without any twin; writes a vehicle "
-            "file. Takes --vehicle and how logs are read, no other option.",
-        ),
-    ] = False,
-    terrain: TerrainOption = None,
-    parameters: Annotated[
-        str | None, typer.Option(help="Dotted names with commas, such as soil.shear.friction_cap.")
-    ] = None,
-    prior: PriorOption = None,
+    vehicle: str | None = None,
+    sensors: bool = False,
+    terrain: list[str] | None = None,
+    parameters: str | None = None,
+    prior: list[str] | None = None,
     source: Annotated[
         str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
     ] = "auto",
-    truth: Annotated[bool, typer.Option("--truth", help="Use the reference pose, too.")] = False,
-    robust: Annotated[bool, typer.Option("--robust", help="Down-weight outliers (Huber).")] = False,
-    channels: Annotated[str | None, typer.Option(help="Use these channels only, with commas.")] = None,
-    window_s: Annotated[float, typer.Option(help="The pose starts anew after so long.")] = 10.0,
-    slope_deg: Annotated[float, typer.Option(help="Slope of the ground, 0 to 25 deg.")] = 0.0,
-    aspect_deg: Annotated[float, typer.Option(help="Direction uphill, deg from east to the left.")] = 0.0,
-    payload_kg: Annotated[float, typer.Option(help="Payload at the centre of gravity, kg.")] = 0.0,
-    suggest: Annotated[
-        bool,
-        typer.Option("--suggest", help="Suggest manoeuvres that would identify the unresolved parameters."),
-    ] = False,
-    how: HowRead = HowRead(),  # noqa: B008 (frozen)
+    truth: bool = False,
+    robust: bool = False,
+    channels: str | None = None,
+    window_s: float = 10.0,
+    slope_deg: float = 0.0,
+    aspect_deg: float = 0.0,
+    payload_kg: float = 0.0,
+    suggest: bool = False,
+    *,
+    how: HowRead,
 ) -> Result:
     """Fit soil and vehicle parameters to logs, with their sigma and what the logs cannot identify.
 
@@ -94,6 +67,23 @@ def calibrate(
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
 
     Example: terrafusion calibrate monday tuesday --sensors --out my_robot.yaml
+
+    Args:
+        vehicle: Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs'.
+        sensors: Learn antenna, gyro, wheel scale and delays from fixes, without any twin; writes a vehicle
+            file. Takes --vehicle and how logs are read, no other option.
+        terrain (SOIL|LABEL=SOIL): Soil of all logs, by name or YAML file; or of one label (repeat). Default:
+            the logs' labels.
+        parameters: Dotted names with commas, such as soil.shear.friction_cap.
+        prior (NAME=VALUE+-SIGMA): Prior of a parameter; repeat for more.
+        truth: Use the reference pose, too.
+        robust: Down-weight outliers (Huber).
+        channels: Use these channels only, with commas.
+        window_s: The pose starts anew after so long.
+        slope_deg: Slope of the ground, 0 to 25 deg.
+        aspect_deg: Direction uphill, deg from east to the left.
+        payload_kg: Payload at the centre of gravity, kg.
+        suggest: Suggest manoeuvres that would identify the unresolved parameters.
     """
     if sensors:
         if terrain or parameters or prior or suggest or truth or channels or robust:

@@ -7,6 +7,7 @@ import functools
 import inspect
 import io
 import json
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -91,8 +92,9 @@ def add_command(
     """Make a function a command that has the shared options.
 
     Args:
-        body: takes the command's own options and, where it writes, `out: Path`; returns what to print. A
-            parameter of the type `HowRead` stands for the options of that class.
+        body: takes the command's own options and, where it writes, `out: Path`; returns what to print.
+            The section `Args` of its docstring describes options, as `name: help` or `name (METAVAR): help`.
+            A parameter of the type `HowRead` stands for the options of that class.
         output: what it writes at `out`; gives a plain `out: Path` the option `--out`.
         instead: what it writes with an option that is called so.
         files: options that are further files to write, each with a word of the files it may replace.
@@ -107,7 +109,12 @@ def add_command(
         for word, kind in shared.items()
     ]
 
+    about, described = _described(body.__doc__ or "")
     own = {one.name: one for one in _spread_out(signature.parameters.values())}
+    own |= {
+        name: own[name].replace(annotation=Annotated[own[name].annotation, option])
+        for name, option in described.items()
+    }
     how_read = next((one.name for one in signature.parameters.values() if one.annotation is HowRead), None)
     if output is not None and own["out"].annotation is Path:
         option = Annotated[Path | None, typer.Option("--out", help=f"{output.help} Default: a dated name.")]
@@ -136,11 +143,24 @@ def add_command(
         if result.status:
             raise typer.Exit(result.status)
 
+    command.__doc__ = about
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     everything = [context, *own.values(), *asked]
     command.__signature__ = signature.replace(parameters=everything)  # type: ignore[attr-defined]
     command.__annotations__ = {one.name: one.annotation for one in everything}
     app.command(name)(command)
+
+
+def _described(docstring: str) -> tuple[str, dict[str, Any]]:
+    """A command's help without the section `Args` of its docstring, and the options that this describes."""
+    about, _, section = inspect.cleandoc(docstring).partition("\n\nArgs:\n")
+    entries = re.findall(r"^    (\w+)(?: \((.+?)\))?: (.+(?:\n {8}.+)*)", section, re.MULTILINE)
+    return about, {
+        name: typer.Option(
+            f"--{name.replace('_', '-')}", metavar=metavar or None, help=" ".join(text.split())
+        )
+        for name, metavar, text in entries
+    }
 
 
 def _spread_out(parameters: Iterable[inspect.Parameter]) -> Iterator[inspect.Parameter]:

@@ -32,11 +32,9 @@ def convert(
     log: LogArgument,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A name ending in .mcap, or a folder.")],
     vehicle: VehicleOption = None,
-    how: HowRead = HowRead(),  # noqa: B008 (frozen)
-    apply_fixes: Annotated[
-        bool,
-        typer.Option("--apply-fixes", help="Apply the repairs that `inspect` offers, and list them."),
-    ] = False,
+    *,
+    how: HowRead,
+    apply_fixes: bool = False,
 ) -> Result:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
 
@@ -51,6 +49,9 @@ def convert(
       terrafusion convert drive_folder drive.mcap
 
       terrafusion convert raw_log repaired_log --apply-fixes
+
+    Args:
+        apply_fixes: Apply the repairs that `inspect` offers, and list them.
     """
     from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.readers import open_recording

@@ -35,7 +35,7 @@ CAPTION = (
 
 def demo(
     out: Path,
-    seed: Annotated[int, typer.Option(help="Seed of the first drive; the others count on.")] = 0,
+    seed: int = 0,
     drives: Annotated[int, typer.Option(min=1, max=100, help="Number of simulated drives.")] = 5,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that work at once.")] = 2,
 ) -> Result:
@@ -45,6 +45,9 @@ def demo(
     comparison, draws it into demo.png and writes report.html with the details of the first drive.
 
     Example: terrafusion demo --out demo-out
+
+    Args:
+        seed: Seed of the first drive; the others count on.
     """
     from terrafusion.datasets.readers import open_recording
     from terrafusion.datasets.writers.log_folder import write_log_folder

@@ -25,10 +25,8 @@ def fetch(
             metavar="[NAME]...", help="A set, or SET/RECORDING; without names the catalogue is shown."
         ),
     ] = None,
-    to: Annotated[
-        Path | None, typer.Option("--to", help="Folder for the files; the user's cache folder otherwise.")
-    ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Use local files only.")] = False,
+    to: Path | None = None,
+    offline: bool = False,
 ) -> Result:
     """Show the catalogue of public recordings, or download from it.
 
@@ -42,6 +40,10 @@ def fetch(
       terrafusion fetch husky_parkinglot
 
       terrafusion fetch borealtc/SNOW/00 wvu_pathfinder/s5t1 --to fieldlogs
+
+    Args:
+        to: Folder for the files; the user's cache folder otherwise.
+        offline: Use local files only.
     """
     from terrafusion.datasets.catalog.catalog import load_catalog
 

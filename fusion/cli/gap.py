@@ -37,12 +37,6 @@ RunsArgument = Annotated[
         "LOG@60-105 is a piece of one, LOG@/45 all of its pieces of 45 s.",
     ),
 ]
-ReferenceOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--reference", metavar="REF", help="Runs that count as normal; repeat for more. None: twin."
-    ),
-]
 
 
 def _explained(effect: str | None) -> None:
@@ -68,37 +62,35 @@ ExplainOption = Annotated[
 def gap(
     runs: RunsArgument,
     out: Path,
-    reference: ReferenceOption = None,
-    vehicle: Annotated[str, typer.Option(help="The twin's vehicle, by name or YAML file.")] = "elevate",
-    terrain: Annotated[
-        list[str] | None,
-        typer.Option("--terrain", metavar="SOIL|LABEL=SOIL", help="Ground of all logs, or of one label."),
-    ] = None,
-    effects: Annotated[
-        str | None, typer.Option(help="Candidates by name, with commas. Default: the whole catalogue.")
-    ] = None,
-    significance: Annotated[float, typer.Option(help="False alarms accepted, 0.001 to 0.5.")] = 0.05,
+    reference: list[str] | None = None,
+    vehicle: str = "elevate",
+    terrain: list[str] | None = None,
+    effects: str | None = None,
+    significance: float = 0.05,
     source: Annotated[
         str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
     ] = "auto",
-    write_vehicle: Annotated[
-        Path | None,
-        typer.Option(
-            "--write-vehicle", metavar="FILE", help="Write the vehicle's file with the effect in it."
-        ),
-    ] = None,
-    judge: Annotated[
-        bool, typer.Option("--judge", help="Also compare the estimator on these logs and on the twin's.")
-    ] = False,
+    write_vehicle: Path | None = None,
+    judge: bool = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
     explain: ExplainOption = None,
-    how: HowRead = HowRead(),  # noqa: B008 (frozen)
+    *,
+    how: HowRead,
 ) -> Result:
     """Diagnose where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
     Writes diagnosis.json and report.html. No truth channel is read.
 
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
+
+    Args:
+        reference (REF): Runs that count as normal; repeat for more. None: twin.
+        vehicle: The twin's vehicle, by name or YAML file.
+        terrain (SOIL|LABEL=SOIL): Ground of all logs, or of one label.
+        effects: Candidates by name, with commas. Default: the whole catalogue.
+        significance: False alarms accepted, 0.001 to 0.5.
+        write_vehicle (FILE): Write the vehicle's file with the effect in it.
+        judge: Also compare the estimator on these logs and on the twin's.
     """
     from terrafusion.fusion.reports.gap import write_diagnosis
     from terrafusion.fusion.reports.gap_text import answer, details, verdict_line

@@ -39,7 +39,7 @@ OUTPUT = Output(
 
 def gap_blind(
     out: Path,
-    quick: Annotated[bool, typer.Option("--quick", help="A small subset: every family, few trials.")] = False,
+    quick: bool = False,
     share: Annotated[
         float, typer.Option(min=0.01, max=1.0, help="Of the trials of every family in the full check.")
     ] = 1.0,
@@ -66,6 +66,9 @@ def gap_blind(
       terrafusion gap-blind --share 0.2 --jobs 2 --out blind
 
       terrafusion gap-blind --backend dask --address tcp://10.0.0.5:8786 --jobs 16 --out blind
+
+    Args:
+        quick: A small subset: every family, few trials.
     """
     from terrafusion.fusion.reports.blind import summary, write_blind
     from terrafusion.twin.gap import diagnose

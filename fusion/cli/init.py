@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -24,37 +24,21 @@ if TYPE_CHECKING:
     from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import FirstVehicle
 
-NumberOption = str | None
-
-
-def _number(flag: str, what: str, metavar: str = "METRES") -> Any:
-    return typer.Option(flag, metavar=metavar, help=what)
-
 
 def init(
     log: LogArgument,
-    out: Annotated[Path, typer.Option("--out", help="The vehicle file to write.")] = Path("my_robot.yaml"),
-    vehicle_name: Annotated[
-        str | None, typer.Option("--vehicle-name", help="Name of the robot. Default: that of the file.")
-    ] = None,
-    drive: Annotated[
-        str | None,
-        typer.Option(help="differential, skid_steer, tracked, ackermann or four_wheel_steer."),
-    ] = None,
-    wheel_radius: Annotated[
-        NumberOption, _number("--wheel-radius", "Wheel radius; without it the fixes give it.")
-    ] = None,
-    track: Annotated[NumberOption, _number("--track", "Distance of left and right wheels.")] = None,
-    wheelbase: Annotated[NumberOption, _number("--wheelbase", "Distance of the axles, if it steers.")] = None,
-    antenna: Annotated[
-        NumberOption, _number("--antenna", "GNSS antenna from the middle of the wheels' contacts.", "X,Y,Z")
-    ] = None,
-    imu_position: Annotated[NumberOption, _number("--imu-position", "IMU, likewise.", "X,Y,Z")] = None,
-    mass: Annotated[NumberOption, _number("--mass", "Mass; only the twin uses it.", "KG")] = None,
-    no_verdict: Annotated[
-        bool, typer.Option("--no-verdict", help="Write the file only; do not replay the log with it.")
-    ] = False,
-    how: HowRead = HowRead(),  # noqa: B008 (frozen)
+    out: Path = Path("my_robot.yaml"),
+    vehicle_name: str | None = None,
+    drive: str | None = None,
+    wheel_radius: str | None = None,
+    track: str | None = None,
+    wheelbase: str | None = None,
+    antenna: str | None = None,
+    imu_position: str | None = None,
+    mass: str | None = None,
+    no_verdict: bool = False,
+    *,
+    how: HowRead,
 ) -> Result:
     """Write the vehicle file of a robot from its first log, and replay the log with it.
 
@@ -66,6 +50,18 @@ def init(
     Example: terrafusion init drive.mcap --out my_robot.yaml
 
     Example: terrafusion init drive.mcap --topic imu=/front/imu --drive tracked --track 0.62
+
+    Args:
+        out: The vehicle file to write.
+        vehicle_name: Name of the robot. Default: that of the file.
+        drive: differential, skid_steer, tracked, ackermann or four_wheel_steer.
+        wheel_radius (METRES): Wheel radius; without it the fixes give it.
+        track (METRES): Distance of left and right wheels.
+        wheelbase (METRES): Distance of the axles, if it steers.
+        antenna (X,Y,Z): GNSS antenna from the middle of the wheels' contacts.
+        imu_position (X,Y,Z): IMU, likewise.
+        mass (KG): Mass; only the twin uses it.
+        no_verdict: Write the file only; do not replay the log with it.
     """
     from terrafusion.datasets.readers.ros.streams import decoded_once
     from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
@@ -31,9 +29,7 @@ def inspect(
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE.html", help="Also write this as a page.")
-    ] = None,
+    report: Path | None = None,
 ) -> Result:
     """Show the contents of a log, measures between its channels, and the findings of the log checks.
 
@@ -51,6 +47,9 @@ def inspect(
       terrafusion inspect wvu_pathfinder/s5t1
 
       terrafusion inspect my_log_folder --json
+
+    Args:
+        report (FILE.html): Also write this as a page.
     """
     from terrafusion.fusion.cli.inspect_page import page_lines, styled_lines
 

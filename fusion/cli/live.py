@@ -20,50 +20,25 @@ LogArgument = Annotated[
     str | None,
     typer.Argument(metavar="[LOG]", help="A recording to run in place of a robot; without one, DDS is used."),
 ]
-RealtimeOption = Annotated[bool, typer.Option("--realtime", help="At the pace of the recording.")]
-ModeOption = Annotated[str, typer.Option(help="adaptive, fixed, robust or innovation, as of `replay`.")]
-DomainOption = Annotated[
-    int | None, typer.Option("--domain", help="DDS domain; by default ROS_DOMAIN_ID, else 0.")
-]
-LoopbackOption = Annotated[bool, typer.Option("--loopback", help="Speak to this machine only (127.0.0.1).")]
-ReliableOption = Annotated[
-    bool, typer.Option("--reliable", help="Ask for lost messages again; by default as ROS 2's sensor data.")
-]
-RateOption = Annotated[float, typer.Option("--rate", help="Odometry a second, at most.")]
-DatumOption = Annotated[
-    str | None,
-    typer.Option("--datum", metavar="LAT,LON,HEIGHT", help="Origin of map, instead of the first fix."),
-]
-SimTimeOption = Annotated[bool, typer.Option("--use-sim-time", help="The time of the robot is /clock.")]
-NamespaceOption = Annotated[
-    str, typer.Option("--namespace", help="Put before the published topics, such as /robot1.")
-]
-WaitOption = Annotated[
-    float, typer.Option("--wait", help="Seconds that samples wait for others of the same time.")
-]
-SecondsOption = Annotated[float | None, typer.Option("--seconds", help="Stop after so long; else Ctrl-C.")]
-FoxgloveOption = Annotated[
-    int | None, typer.Option("--foxglove", metavar="PORT", help="Show it in Foxglove at ws://localhost:PORT.")
-]
 
 
 def live(
     log: LogArgument = None,
     vehicle: VehicleOption = None,
-    realtime: RealtimeOption = False,
-    mode: ModeOption = "adaptive",
+    realtime: bool = False,
+    mode: str = "adaptive",
     topic: TopicOption = None,
     stamps: StampsOption = "header",
-    domain: DomainOption = None,
-    loopback: LoopbackOption = False,
-    reliable: ReliableOption = False,
-    rate: RateOption = 50.0,
-    datum: DatumOption = None,
-    use_sim_time: SimTimeOption = False,
-    namespace: NamespaceOption = "",
-    wait: WaitOption = 0.02,
-    seconds: SecondsOption = None,
-    foxglove: FoxgloveOption = None,
+    domain: int | None = None,
+    loopback: bool = False,
+    reliable: bool = False,
+    rate: float = 50.0,
+    datum: str | None = None,
+    use_sim_time: bool = False,
+    namespace: str = "",
+    wait: float = 0.02,
+    seconds: float | None = None,
+    foxglove: int | None = None,
 ) -> Result:
     """Run the estimator beside a ROS 2 robot, without ROS: it speaks DDS itself.
 
@@ -76,6 +51,20 @@ def live(
     Example: terrafusion live --vehicle husky --topic wheels=/odom --domain 7 --foxglove 8765
 
     Example: terrafusion live drive.bag --vehicle husky --realtime
+
+    Args:
+        realtime: At the pace of the recording.
+        mode: adaptive, fixed, robust or innovation, as of `replay`.
+        domain: DDS domain; by default ROS_DOMAIN_ID, else 0.
+        loopback: Speak to this machine only (127.0.0.1).
+        reliable: Ask for lost messages again; by default as ROS 2's sensor data.
+        rate: Odometry a second, at most.
+        datum (LAT,LON,HEIGHT): Origin of map, instead of the first fix.
+        use_sim_time: The time of the robot is /clock.
+        namespace: Put before the published topics, such as /robot1.
+        wait: Seconds that samples wait for others of the same time.
+        seconds: Stop after so long; else Ctrl-C.
+        foxglove (PORT): Show it in Foxglove at ws://localhost:PORT.
     """
     if log is not None:
         _run_log(log, vehicle, realtime)

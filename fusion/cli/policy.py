@@ -26,18 +26,8 @@ def fit(
         typer.Argument(help="Labelled logs with a truth; they update the noise fitted to simulated runs."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds of soil, heading and sensor noise.")] = 3,
-    ground: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SOIL", help="Soil to drive on; repeat for more. By default the four of the detector."
-        ),
-    ] = None,
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            help="Simulated vehicle of the library (elevate), and the vehicle of logs that name none."
-        ),
-    ] = None,
+    ground: list[str] | None = None,
+    vehicle: str | None = None,
 ) -> Result:
     """Drive the twin over soils, slopes, payloads and speeds, and fit each sensor's noise on each ground.
 
@@ -46,6 +36,10 @@ def fit(
 
     Example: terrafusion policy fit --out policy.yaml
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
+
+    Args:
+        ground (SOIL): Soil to drive on; repeat for more. By default the four of the detector.
+        vehicle: Simulated vehicle of the library (elevate), and the vehicle of logs that name none.
     """
     import dataclasses
 

@@ -42,53 +42,6 @@ OUTPUT = Output(
     ("metrics.json",),
     mark="terrafusion.replay/",
 )
-OutageOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--gnss-outage",
-        metavar="START:SECONDS",
-        help="Hold out all fixes of a stretch and score there; repeat for more.",
-    ),
-]
-ModeOption = Annotated[
-    str,
-    typer.Option(
-        help="adaptive: noise follows the detected terrain; fixed: one noise for all terrains; robust: "
-        "fixed with a robust loss; innovation: noise estimated from the innovations."
-    ),
-]
-PolicyOption = Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")]
-BatchOption = Annotated[
-    bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of with a fixed lag as live.")
-]
-CalibrateOption = Annotated[
-    bool,
-    typer.Option(
-        "--calibrate",
-        help="Also estimate corrections of the vehicle file: wheel radius, antenna, IMU mounting, "
-        "delays of wheels and GNSS.",
-    ),
-]
-McapOption = Annotated[
-    bool,
-    typer.Option(
-        "--mcap", help="Also write the log with the estimate (odometry, diagnostics) to estimate.mcap."
-    ),
-]
-RerunOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.rrd", help="Also write the replay for the Rerun viewer (extra: rerun)."),
-]
-MagnetometerOption = Annotated[
-    bool, typer.Option("--magnetometer", help="Use the log's magnetometer; a barometer is always used.")
-]
-GroundsOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.yaml",
-        help="What the robot learned of its grounds: read if it is there, and written after the drive.",
-    ),
-]
 DeclinationOption = Annotated[
     float | None,
     typer.Option(
@@ -103,18 +56,19 @@ DeclinationOption = Annotated[
 def replay(
     log: LogArgument,
     out: Path,
-    mode: ModeOption = "adaptive",
+    mode: str = "adaptive",
     vehicle: VehicleOption = None,
-    policy: PolicyOption = None,
-    batch: BatchOption = False,
-    calibrate: CalibrateOption = False,
-    mcap: McapOption = False,
-    rerun: RerunOption = None,
-    gnss_outage: OutageOption = None,
-    magnetometer: MagnetometerOption = False,
+    policy: Path | None = None,
+    batch: bool = False,
+    calibrate: bool = False,
+    mcap: bool = False,
+    rerun: Path | None = None,
+    gnss_outage: list[str] | None = None,
+    magnetometer: bool = False,
     declination: DeclinationOption = None,
-    grounds: GroundsOption = None,
-    how: HowRead = HowRead(),  # noqa: B008 (frozen)
+    grounds: Path | None = None,
+    *,
+    how: HowRead,
 ) -> Result:
     """Estimate a recorded drive as it would have run live, and score it.
 
@@ -124,6 +78,20 @@ def replay(
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
 
     Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
+
+    Args:
+        mode: adaptive: noise follows the detected terrain; fixed: one noise for all terrains; robust: fixed
+            with a robust loss; innovation: noise estimated from the innovations.
+        policy: Weighting policy; by default the one shipped.
+        batch: Smooth the whole drive at once, instead of with a fixed lag as live.
+        calibrate: Also estimate corrections of the vehicle file: wheel radius, antenna, IMU mounting, delays
+            of wheels and GNSS.
+        mcap: Also write the log with the estimate (odometry, diagnostics) to estimate.mcap.
+        rerun (FILE.rrd): Also write the replay for the Rerun viewer (extra: rerun).
+        gnss_outage (START:SECONDS): Hold out all fixes of a stretch and score there; repeat for more.
+        magnetometer: Use the log's magnetometer; a barometer is always used.
+        grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, and written after the
+            drive.
     """
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.config.estimator_config import MODES

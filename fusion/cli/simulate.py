@@ -25,28 +25,14 @@ OUTPUT = Output(
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a YAML file.")],
     out: Path,
-    vehicle: Annotated[str, typer.Option(help="Name of a vehicle, or a YAML file.")] = "elevate",
-    terrain: Annotated[
-        str | None, typer.Option(help="One ground for the whole route, instead of the scenario's.")
-    ] = None,
-    slope_deg: Annotated[
-        float | None, typer.Option(help="Slope of the ground, 0 to 25 deg, instead of the scenario's.")
-    ] = None,
-    cross_slope_deg: Annotated[
-        float | None,
-        typer.Option(help="Its slope across the start heading, -25 to 25 deg, rising to the left."),
-    ] = None,
-    payload_kg: Annotated[float | None, typer.Option(help="Payload, kg, instead of the scenario's.")] = None,
-    payload_at: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="Its centre of gravity, m forward, left and up of the body origin, which lies on the ground "
-            "midway between the wheels; by default the robot's own centre of gravity.",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of all sensor noise and of ground that varies.")] = 0,
-    noiseless: Annotated[bool, typer.Option("--noiseless", help="Exact sensors, for checks.")] = False,
+    vehicle: str = "elevate",
+    terrain: str | None = None,
+    slope_deg: float | None = None,
+    cross_slope_deg: float | None = None,
+    payload_kg: float | None = None,
+    payload_at: str | None = None,
+    seed: int = 0,
+    noiseless: bool = False,
     effect: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,6 +56,17 @@ def simulate(
     terrafusion simulate straight --cross-slope-deg 10 --payload-kg 30 --payload-at 0,0.1,0.4 --out tilted
 
     terrafusion simulate spin --effect wheel_radius/scale=0.03 --effect gyro_bias/constant=0.01 --out worn
+
+    Args:
+        vehicle: Name of a vehicle, or a YAML file.
+        terrain: One ground for the whole route, instead of the scenario's.
+        slope_deg: Slope of the ground, 0 to 25 deg, instead of the scenario's.
+        cross_slope_deg: Its slope across the start heading, -25 to 25 deg, rising to the left.
+        payload_kg: Payload, kg, instead of the scenario's.
+        payload_at (X,Y,Z): Its centre of gravity, m forward, left and up of the body origin, which lies on
+            the ground midway between the wheels; by default the robot's own centre of gravity.
+        seed: Seed of all sensor noise and of ground that varies.
+        noiseless: Exact sensors, for checks.
     """
     from terrafusion.twin.simulate import simulate_run
 

@@ -29,16 +29,14 @@ OUTPUT = Output(
 
 def study(
     out: Path,
-    quick: Annotated[bool, typer.Option("--quick", help="Two seeds and a small batch.")] = False,
+    quick: bool = False,
     seeds: Annotated[
         int | None, typer.Option(help="Seeds a case (10; 2 when quick).", show_default=False)
     ] = None,
     jobs: JobsOption = None,
     backend: BackendOption = "loky",
     address: AddressOption = None,
-    bags: Annotated[
-        bool, typer.Option("--bags", help="Also write the three runs as ROS 2 bags (MCAP).")
-    ] = False,
+    bags: bool = False,
 ) -> Result:
     """Reproduce the study this project starts from, and judge the twin against it, statement by statement.
 
@@ -46,6 +44,10 @@ def study(
     test. Prints Tab. 4 side by side; writes agreement.csv, metrics.json, batch.csv and report.html.
 
     Example: terrafusion study --out study-out --quick
+
+    Args:
+        quick: Two seeds and a small batch.
+        bags: Also write the three runs as ROS 2 bags (MCAP).
     """
     from terrafusion.fusion.reports.study import write_bags, write_plan, write_study
     from terrafusion.twin.study.study import StudyPlan, run_study

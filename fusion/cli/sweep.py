@@ -30,12 +30,6 @@ OUTPUT = Output(
     ("sweep.json",),
     goes_on=True,
 )
-RecordingsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="N|all", help="Also write run N, or all, with its sensors as a log; repeat for more."
-    ),
-]
 
 
 def sweep(
@@ -46,8 +40,8 @@ def sweep(
     address: AddressOption = None,
     max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html and plots.")] = True,
-    recordings: RecordingsOption = None,
-    recordings_format: Annotated[str, typer.Option(help="folder: log folders; mcap: ROS 2 bags.")] = "folder",
+    recordings: list[str] | None = None,
+    recordings_format: str = "folder",
 ) -> Result:
     """Run a scenario over friction, terrain, slope, payload, speed and seeds.
 
@@ -56,6 +50,10 @@ def sweep(
     sensors_by_ground.
 
     Example: terrafusion sweep friction_slope --out results --jobs 2
+
+    Args:
+        recordings (N|all): Also write run N, or all, with its sensors as a log; repeat for more.
+        recordings_format: folder: log folders; mcap: ROS 2 bags.
     """
     from terrafusion.twin.sweep.load import load_sweep
     from terrafusion.twin.sweep.recordings import check_runs, write_recordings

@@ -88,21 +88,13 @@ def evaluate(
     logs: Annotated[
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: new simulated runs.")
     ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            "--model",
-            help="Model file: with logs of `train LOGS`, else of the detector (default: the shipped one).",
-        ),
-    ] = None,
+    model: Path | None = None,
     seeds: Annotated[
         int | None,
         typer.Option(min=1, max=1000, help="New seeds of simulated runs (1).", show_default=False),
     ] = None,
-    test: Annotated[
-        list[str] | None, typer.Option("--test", help="Labelled logs of another robot (may be given again).")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="JSON file for the scores of the logs.")] = None,
+    test: list[str] | None = None,
+    out: Path | None = None,
 ) -> Result:
     """Score a terrain model on new simulated runs, or a classifier on labelled logs, cross-validated by run.
 
@@ -114,6 +106,11 @@ def evaluate(
     Example: terrafusion terrain eval
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
     Example: terrafusion terrain eval --model grounds.yaml another_day/*/imu_*.csv
+
+    Args:
+        model: Model file: with logs of `train LOGS`, else of the detector (default: the shipped one).
+        test: Labelled logs of another robot (may be given again).
+        out: JSON file for the scores of the logs.
     """
     if logs:
         no_seeds(seeds)
