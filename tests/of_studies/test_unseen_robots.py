@@ -12,7 +12,15 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 from tests.studies.unseen_robots.draw import DRIVES, KINDS, Robot, draw
 from tests.studies.unseen_robots.machine import LOOP_S, STANDING_S, Driven, drive
 from tests.studies.unseen_robots.sensors import recording_of
-from tests.studies.unseen_robots.study import EKF, MODES, Result, table
+from tests.studies.unseen_robots.study import (
+    EKF,
+    MODES,
+    Learned,
+    Result,
+    numbers_table,
+    table,
+    true_numbers,
+)
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 
@@ -92,3 +100,14 @@ def test_the_table_compares_with_the_filter() -> None:
     lines = table(results)
     assert "fixed over EKF, 10 s: 0.50, lost 0 of 1, worst 0.50, inside 95 % ellipses 90 %" in lines
     assert "adaptive over EKF, 10 s: 1.50, lost 1 of 1, worst 1.50, inside 95 % ellipses 100 %" in lines
+
+
+def test_learned_numbers_are_held_against_the_truth() -> None:
+    robot = plain("differential", fix_delay_s=0.3, imu_yaw_rad=np.pi)
+    truth = true_numbers(robot)
+    assert truth["antenna_x_m"] == robot.antenna_m[0] - 0.5 * robot.wheelbase_m
+    assert truth["gnss_delay_s"] == pytest.approx(0.3 - 0.005)
+    numbers = [Learned("one", "imu_yaw_rad", value, 0.01, truth["imu_yaw_rad"]) for value in (-3.13, 3.0)]
+    assert numbers_table(numbers) == [
+        "imu_yaw_rad: within 2 sigma 1 of 2, sigma 0.01 (median), worst 14.2 sigma"
+    ]

@@ -278,6 +278,10 @@ STUDIES = (
         | {
             f"inside_{seconds}_s": rf"adaptive over EKF, {seconds} s: .* ellipses (\d+ %)"
             for seconds in (10, 30)
+        }
+        | {
+            f"{number}_held": rf"{number}: within 2 sigma (\d+ of \d+)"
+            for number in ("antenna_x_m", "gnss_delay_s", "imu_yaw_rad", "wheel_scale")
         },
     ),
     Study(

@@ -4,12 +4,14 @@
 
 The robots are rigid bodies in MuJoCo (`machine`), drawn by seed (`draw`): three drive types, unknown antenna,
 turned and tilted IMU, late fixes, three receivers, slick patches. terrafusion gets the log with wheel radius,
-track and drive type, as an owner knows them, and runs with its defaults. Seeds below 100 are for development.
+track and drive type, as an owner knows them, and runs with its defaults. What self-calibration says of a
+robot after a drive with all fixes is held against the truth. Seeds below 100 are for development.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from terrafusion.fusion.api.replays import replay
 from tests.studies.opponents import ekf, ours
 from tests.studies.opponents.drives import vehicle_of
 from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 from tests.studies.opponents.protocol import Row, scored, streams_of
 from tests.studies.opponents.summary import geometric_mean, losses, ratio
-from tests.studies.unseen_robots.draw import draw
+from tests.studies.unseen_robots.draw import Robot, draw
 from tests.studies.unseen_robots.machine import drive
 from tests.studies.unseen_robots.sensors import recording_of
 
@@ -46,6 +49,22 @@ class Result:
 
 
 @dataclass(frozen=True)
+class Learned:
+    """A number of a robot after a drive: what self-calibration says, its sigma, and the truth."""
+
+    robot: str
+    number: str
+    value: float
+    sigma: float
+    truth: float
+
+    def off_sigmas(self) -> float:
+        """Distance from the truth in sigmas; an angle may wrap."""
+        off = self.value - self.truth
+        return abs(math.remainder(off, math.tau) if self.number == "imu_yaw_rad" else off) / self.sigma
+
+
+@dataclass(frozen=True)
 class Work:
     """All estimators on the robot of a seed."""
 
@@ -53,8 +72,8 @@ class Work:
     lengths: tuple[float, ...]
 
 
-def compute(work: Work) -> list[dict[str, Any]]:
-    """Results of one robot."""
+def compute(work: Work) -> dict[str, list[dict[str, Any]]]:
+    """Results and learned numbers of one robot."""
     robot = draw(work.seed)
     recording = recording_of(robot, drive(robot))
     streams = streams_of(recording, vehicle_of(recording, None))
@@ -69,7 +88,41 @@ def compute(work: Work) -> list[dict[str, Any]]:
                 print(f"{robot.name}, {mode}: {line}", file=sys.stderr)
             shares = [row.share_inside for row in replayed if row.share_inside is not None]
             out.append(_result(robot.name, seconds, mode, replayed, shares))
-    return [asdict(result) for result in out]
+    truth = true_numbers(robot)
+    numbers = [
+        Learned(robot.name, n.state, n.value, n.sigma, truth[n.state])
+        for n in replay(recording, mode="fixed").learned
+        if n.state in truth
+    ]
+    return {"results": [asdict(one) for one in out], "numbers": [asdict(one) for one in numbers]}
+
+
+def true_numbers(robot: Robot) -> dict[str, float]:
+    """The numbers that self-calibration looks for. Slip makes that of the wheels larger than the tyre's.
+
+    The body's origin lies between the driven wheels; samples of the IMU are stamped at their end.
+    """
+    ahead_m = 0.5 * robot.wheelbase_m if robot.drive == "differential" else 0.0
+    return {
+        "antenna_x_m": robot.antenna_m[0] - ahead_m,
+        "antenna_y_m": robot.antenna_m[1],
+        "gnss_delay_s": robot.fix_delay_s - 0.5 / robot.imu_hz,
+        "imu_yaw_rad": robot.imu_yaw_rad,
+        "turn_scale": 1.0 / robot.gyro_scale - 1.0,
+        "wheel_scale": robot.wheel_error - 1.0,
+    }
+
+
+def numbers_table(numbers: Sequence[Learned]) -> list[str]:
+    """A line a number: how often it is told within two sigma, and by how many sigmas it is off."""
+    lines = []
+    for name in dict.fromkeys(n.number for n in numbers):
+        mine = [n for n in numbers if n.number == name]
+        off = np.array([n.off_sigmas() for n in mine])
+        sigma = float(np.median([n.sigma for n in mine]))
+        held = f"within 2 sigma {int((off <= 2.0).sum())} of {len(off)}"
+        lines.append(f"{name}: {held}, sigma {sigma:.3g} (median), worst {off.max():.1f} sigma")
+    return lines
 
 
 def _result(
@@ -137,7 +190,8 @@ def main() -> int:
     tasks = [Task(f"robot {seed} {given.seconds}", code, Work(seed, tuple(given.seconds))) for seed in seeds]
     run_all(tasks, compute, given.out / "parts", given.jobs, 60.0 * given.minutes)
     done = [found for task in tasks if (found := result_of(task, given.out / "parts")) is not None]
-    print("\n".join(table([Result(**entry) for found in done for entry in found])))
+    print("\n".join(table([Result(**entry) for found in done for entry in found["results"]])))
+    print("\n".join(numbers_table([Learned(**entry) for found in done for entry in found["numbers"]])))
     if len(done) < len(tasks):
         print(f"{len(tasks) - len(done)} of {len(tasks)} robots not run yet")
     return 0
