@@ -1,6 +1,7 @@
 """`terrafusion`: the command line, one file a command.
 
-Heavy packages are imported inside the command that needs them, so that
+A command is a function whose docstring is its help and, in `Args`, describes its options (see
+`command.add_command`). Heavy packages are imported inside the command that needs them, so that
 `terrafusion --help` is fast.
 """
 

@@ -7,6 +7,10 @@ import sys
 import time
 
 import pytest
+import typer
+
+from terrafusion.fusion.cli.command import Result, add_command
+from terrafusion.fusion.cli.main import app
 
 
 @pytest.mark.parametrize(
@@ -51,3 +55,33 @@ def test_help_loads_no_heavy_package() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert time.monotonic() - begun < 5.0, "0.2 s on an idle machine"
+
+
+def described(big: bool = False, place: str | None = None) -> Result:
+    """Do it.
+
+    Args:
+        big: Do much of it,
+            and more.
+        place (X,Y): Where: in metres.
+    """
+    return Result([f"{big} {place}"])
+
+
+def test_options_are_described_in_the_docstring_of_their_command() -> None:
+    """Its section `Args` is not part of the help; long entries go on in lines that stand deeper."""
+    small = typer.Typer()
+    add_command(small, "do", described)
+    command = typer.main.get_command(small)
+    options = {one.name: one for one in command.params}
+    assert command.help == "Do it."
+    assert (options["big"].opts, options["big"].secondary_opts) == (["--big"], [])
+    assert options["big"].help == "Do much of it, and more."
+    assert (options["place"].metavar, options["place"].help) == ("X,Y", "Where: in metres.")
+
+
+def test_every_option_has_a_help() -> None:
+    commands = list(typer.main.get_command(app).commands.values())
+    commands += [inner for one in commands for inner in getattr(one, "commands", {}).values()]
+    missing = [f"{c.name} {p.name}" for c in commands for p in c.params if not p.help]
+    assert not missing
