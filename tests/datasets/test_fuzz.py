@@ -22,6 +22,5 @@ def test_damaged_input_is_used_or_refused(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"all {sum(CASES.values())} cases, defects 0" in done.stdout, done.stdout + done.stderr
-    for kind, fewest in (("readers", 5), ("yaml", 0), ("cli", 0)):  # neither all harmless nor all refused
-        (worked,) = map(int, re.findall(rf"{kind} .*worked (\d+)", done.stdout))
-        assert fewest <= worked < 0.9 * CASES[kind], done.stdout
+    (worked,) = map(int, re.findall(r"readers .*worked (\d+)", done.stdout))
+    assert 5 < worked < 86, done.stdout  # neither all that harmless nor all refused at the door
