@@ -21,6 +21,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -225,8 +226,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def run(cells: int, seconds: float, out: Path, first: int = 0) -> list[dict[str, Any]]:
-    """Try cells in turn until all are done or the time is over; what is in `out` is not done again."""
+def run(
+    cells: int, seconds: float, out: Path, first: int = 0, faults: Sequence[str] = tuple(FAULTS)
+) -> list[dict[str, Any]]:
+    """Try cells with one of `faults` in turn until all are done or the time is over.
+
+    What is in `out` is not done again.
+    """
     data = os.environ.get("TERRAFUSION_DATA", "")
     logs = (*TWIN, *FIELD) if data else TWIN
     out.mkdir(parents=True, exist_ok=True)
@@ -238,8 +244,9 @@ def run(cells: int, seconds: float, out: Path, first: int = 0) -> list[dict[str,
         for number in range(first, first + cells):
             if time.monotonic() > until:
                 break
-            if number not in done:
-                rows.append(tried(Cell.drawn(number, logs)))
+            cell = Cell.drawn(number, logs)
+            if number not in done and set(faults) & set(cell.faults):
+                rows.append(tried(cell))
                 kept.write(json.dumps(rows[-1]) + "\n")
                 kept.flush()
     return sorted(rows, key=lambda row: row["number"])
@@ -250,11 +257,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--cells", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--faults", nargs="*", choices=[*FAULTS], default=[*FAULTS])
     parser.add_argument("--seconds", type=float, default=1200.0, help="stop after so long")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    print(table(run(given.cells, given.seconds, given.out, given.first)))
+    print(table(run(given.cells, given.seconds, given.out, given.first, given.faults)))
 
 
 if __name__ == "__main__":
