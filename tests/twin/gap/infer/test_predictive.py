@@ -57,3 +57,12 @@ def test_what_states_and_robot_explain_is_no_energy() -> None:
     with_it, without = (energies(products, u, np.ones(2), SIGMA, ROBOT) for u in (used, 0.0 * used))
     assert (with_it < 0.1).all()
     assert (without > 1.0).all()
+
+
+def test_states_are_fitted_to_what_signatures_and_the_robot_leave() -> None:
+    X, _ = run(5)
+    used, states = np.array([0.2, -0.1, 0.3, 1.5, -2.0]), np.array([0.5, 1.0])
+    shared = np.concatenate([ROBOT.mean, np.zeros(Q)])
+    _, products = run(5, X[:, :T] @ states + X[:, T:-1] @ (used + shared))
+    np.testing.assert_allclose(products.fitted_states(used, np.full(T, 1e4), ROBOT), states, atol=1e-6)
+    assert abs(products.fitted_states(used, np.full(T, 1e-3), ROBOT)).max() < 1e-3

@@ -8,7 +8,7 @@ import pytest
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.infer.bank import Ladder
 from terrafusion.twin.gap.infer.predictive import Metric
-from terrafusion.twin.gap.infer.single_effects import Laws
+from terrafusion.twin.gap.infer.single_effects import RIDGE, Laws
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "encoder_dropout"])
 ROWS, SIZE = 300, 4.0
@@ -52,6 +52,15 @@ def test_sizes_are_unbiased_and_their_sigma_is_the_scatter() -> None:
     assert 0.8 < np.std(z) < 1.25
 
 
+def test_a_size_that_runs_hardly_show_is_small() -> None:
+    """As much information in the runs as before them: half of the size."""
+    i, at = law("gyro_scale", "scale"), CANDIDATES.keys.index("gyro_scale/scale")
+    columns, signatures = problem(4)
+    columns[:, at] *= np.sqrt(RIDGE) / np.linalg.norm(columns[:, at])
+    m, laws = metric_of(columns, signatures, 0.5 * columns[:, at])
+    assert laws.fit(m, (i,)).values[0][0] == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize("size", [0.5, 1.0, 2.0, 3.0])
 def test_a_size_between_two_simulated_ones_is_interpolated(size: float) -> None:
     columns, (one, three) = problem(1)[0], problem(1)[1].T
@@ -60,6 +69,9 @@ def test_a_size_between_two_simulated_ones_is_interpolated(size: float) -> None:
     fit = laws.fit(m, (law("encoder_scale", "in_loop"),))
     assert fit.values[0][0] == pytest.approx(size, abs=1e-3)
     assert fit.gain == pytest.approx(0.5 * between @ between, rel=1e-6)
+    if size != 1.0:  # a corner, where each side has a slope of its own
+        slope = one if size < 1.0 else 0.5 * (three - one)
+        assert fit.covariance[0][0, 0] == pytest.approx(1.0 / (slope @ slope), rel=1e-3)
 
 
 def test_an_effect_of_one_side_is_not_believed_on_the_other() -> None:
