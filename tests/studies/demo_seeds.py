@@ -11,8 +11,10 @@ from statistics import median
 
 import numpy as np
 
-import terrafusion as tf
 from terrafusion.datasets.core.bootstrap import percentile_interval
+from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.replay import replay
+from terrafusion.twin.simulate import simulate
 
 DRIVES = {
     "demo": ((75.0, 60.0), {}),
@@ -29,8 +31,8 @@ DRAWS = 4000
 def errors_m(scenario: str, mode: str, seed: int) -> tuple[float, float, float]:
     """Error of the whole drive (RMS), median in the outage, and at its end, m."""
     outage, options = DRIVES[scenario]
-    log = tf.simulate(scenario, seed=seed, **options)
-    scores = tf.replay(log, mode=mode, outages=[outage]).scores
+    log = simulate(scenario, seed=seed, **options)
+    scores = replay(log, mode=mode, outages=[Outage(*outage)], findings=()).scores
     lost = scores.outages[0]
     assert scores.ate_m is not None
     assert lost.median_m is not None
@@ -50,9 +52,10 @@ def main() -> None:
     """Print one line a drive and mode: medians over seeds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--drive", choices=tuple(DRIVES), action="append", help="this one alone")
     given = parser.parse_args()
     print(f"{'drive':14s} {'mode':9s} whole drive, m   median in outage, m   end of outage, m   drives won")
-    for scenario in DRIVES:
+    for scenario in given.drive or DRIVES:
         found = {
             mode: [errors_m(scenario, mode, FIRST_SEED + i) for i in range(given.seeds)] for mode in MODES
         }

@@ -217,12 +217,12 @@ def ratio(errors: Array, fixed: Array) -> str:
 
 def report(family: str, found: dict[str, list[Array]]) -> None:
     """One line an arm: error at the end, over fixed, and the length of each cause."""
-    print(f"{family:36s} end, m   over fixed            " + " ".join(f"{c:>11s}" for c in CAUSES))
+    print(f"{'':42s} end, m   over fixed            " + " ".join(f"{c:>11s}" for c in CAUSES))
     ends = {arm: np.linalg.norm(np.array(rows).sum(axis=1), axis=1) for arm, rows in found.items()}
     for arm, rows in found.items():
         lengths = np.sqrt(np.mean(np.sum(np.array(rows) ** 2, axis=2), axis=0))
         print(
-            f"{arm:36s} {np.median(ends[arm]):6.2f}   {ratio(ends[arm], ends['fixed']):20s}  "
+            f"{family + ' ' + arm:42s} {np.median(ends[arm]):6.2f}   {ratio(ends[arm], ends['fixed']):20s}  "
             + " ".join(f"{x:11.2f}" for x in lengths),
             flush=True,
         )

@@ -162,6 +162,13 @@ STUDIES = (
         },
     ),
     Study(
+        "outage_causes",
+        "What makes the error at the end of the demo's outage, and of mixed ground in the benchmark?",
+        module("outage_causes", "--arms", "fixed;adaptive"),
+        8,
+        {f"{f}_ratio": rf"{f} adaptive +[\d.]+ +([\d.]+ \[[\d.]+, [\d.]+\])" for f in ("demo", "mixed")},
+    ),
+    Study(
         "gap_other_drives",
         "Does the diagnosis hold on drives that its references did not make?",
         module("gap_other_drives"),
@@ -373,6 +380,17 @@ STUDIES = (
         | {
             f"slippery_{source}": rf"twin to {source} +\d+ runs: balanced accuracy [\d.]+ by window, ([\d.]+)"
             for source in ("norlab_drive", "borealtc")
+        },
+    ),
+    Study(
+        "slippery",
+        "Is slippery ground told from firm on a robot left out, by features relative to the robot itself?",
+        module("slip_model.slippery"),
+        4,
+        {
+            f"{fit.split()[0]}_{source}": rf"{fit} to {source} +\d+ runs: .* by window, ([\d.]+) by run"
+            for source in ("norlab_drive", "borealtc")
+            for fit in ("twin", "other robot", "both")
         },
     ),
     Study(
