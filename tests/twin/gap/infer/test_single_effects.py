@@ -61,7 +61,7 @@ def test_a_size_that_runs_hardly_show_is_small() -> None:
     assert laws.fit(m, (i,)).values[0][0] == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize("size", [0.5, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("size", [0.5, 1.0, 1.5, 2.0, 3.0])
 def test_a_size_between_two_simulated_ones_is_interpolated(size: float) -> None:
     columns, (one, three) = problem(1)[0], problem(1)[1].T
     between = size * one if size <= 1.0 else one + 0.5 * (size - 1.0) * (three - one)
