@@ -89,6 +89,8 @@ def find_sensors(
         recording = recording_of(gathered, repairing)
     except (DataError, BagError):
         recording = recording_of(_usable(gathered, ArrivingMessages(request, dict(chosen))), repairing)
+        if recording.imu is None or recording.wheels is None:
+            raise
     overrides = recording.overrides
     if "imu" in mounted:
         overrides = dataclasses.replace(overrides, imu_m=mounted["imu"][0])

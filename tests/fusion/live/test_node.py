@@ -382,3 +382,17 @@ def test_a_sample_without_numbers_does_not_delay_the_start(messages: list[BagMes
     assert run.node.counts["refused"] == len(seconds)
     assert any(line.startswith("refused: imu: a sample lacks numbers") for line in run.said)
     assert run.history.states[0].t_ns - messages[0][0] < 4_000_000_000
+
+
+def test_an_imu_without_any_usable_sample_is_waited_for(messages: list[BagMessage]) -> None:
+    begin = messages[0][0] + 2_500_000_000
+    infinite = np.full(3, np.inf).tobytes()
+    late = [
+        (t, topic, msgtype, cdr[:-96] + infinite + cdr[-72:] if topic == "/imu/data" and t < begin else cdr)
+        for t, topic, msgtype, cdr in messages[: len(messages) // 2]
+    ]
+    run = Run().feed(late)
+    assert any(line.startswith("waiting: live, /imu/data") for line in run.said)
+    assert run.node.estimator is not None
+    assert run.node.estimator.config.inputs.imu == "six_axis"
+    assert run.history.states[0].t_ns > begin
