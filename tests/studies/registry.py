@@ -285,6 +285,10 @@ STUDIES = (
             for mode in ("fixed", "adaptive")
             for what, known in (("log", "vehicle of the log"), ("unknown", "wheel radius and track alone"))
             for seconds in (10, 30, 60)
+        }
+        | {
+            "over_ekf": r"adaptive / EKF, vehicle of the log: ([\d.]+)",
+            "lost_to_ekf": r"adaptive / EKF, vehicle of the log: .*lost (\d+ of \d+)",
         },
         "opponents.png",
     ),
