@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIXED, ADAPTIVE = "fixed", "adaptive"
-EQUAL = 0.05
-"""Relative difference below which two errors count as equal."""
+EQUAL, EQUAL_M = 0.05, 0.005
+"""Differences, relative and in metres, below which two errors count as equal: the table shows centimetres."""
 _ODOM = "#009e73"
 
 
@@ -80,10 +80,10 @@ def where_it_does_not_help(table: Table) -> str:
     """One sentence: in which rows and drives adaptive weights are no better than fixed ones."""
     even, worse = [], []
     for row, errors in table.items():
-        ratio = float(np.median(errors[ADAPTIVE])) / max(float(np.median(errors[FIXED])), 1e-9)
-        if abs(ratio - 1.0) <= EQUAL:
+        adaptive, fixed = (float(np.median(errors[mode])) for mode in (ADAPTIVE, FIXED))
+        if abs(adaptive - fixed) <= max(EQUAL * fixed, EQUAL_M):
             even.append(row)
-        elif ratio > 1.0:
+        elif adaptive > fixed:
             worse.append(row)
     end = table["at the end of the outage"]
     pairs = list(zip(end[ADAPTIVE], end[FIXED], strict=True))

@@ -40,6 +40,11 @@ def test_losses_are_named(adaptive_m: tuple[float, float, float], expected: str)
     assert where_it_does_not_help(table_of(runs, OUTAGE)) == expected
 
 
+def test_errors_that_the_table_shows_alike_are_equal() -> None:
+    runs = [run_of("fixed", 1, 0.020, 0.5, 2.0), run_of("adaptive", 1, 0.024, 0.3, 1.0)]
+    assert "they equal fixed ones with GNSS" in where_it_does_not_help(table_of(runs, OUTAGE))
+
+
 def test_a_jump_shows_in_its_frame_alone() -> None:
     run = run_of("adaptive", 0, 0.1, 0.5, 2.0)
     assert run.largest_step_m("map") == pytest.approx(np.hypot(0.5, 2.0))
