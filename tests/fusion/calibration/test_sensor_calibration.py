@@ -204,5 +204,5 @@ def test_a_robot_that_steers_its_front_wheels_has_its_antenna_where_its_file_say
     vehicle = with_overrides(load_vehicle("elevate"), Overrides(drive="ackermann"))
     result = replay(simulate(scenario, vehicle=vehicle, seed=3), vehicle=vehicle, mode="fixed")
     antenna = next(number for number in result.learned if number.state == "antenna_x_m")
-    assert antenna.sigma < 0.04
+    assert antenna.sigma < 0.06
     assert abs(antenna.value) < 2.5 * antenna.sigma
