@@ -16,10 +16,7 @@ from terrafusion.fusion.calibration.numbers import GNSS_DELAY, Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 STEP_S = 4.0
-"""Time between the begins of steps while the robot drives, once they settle."""
-SETTLED, MOST_UNSETTLED = 0.9, 12
-"""Steps follow each other at once as long as each leaves less than this share of the misfit before it, but so
-many at most: late fixes are a second off the path before the delay is found."""
+"""Time between the begins of steps while the robot drives."""
 FEWEST_NODES, MOST_NODES = 4, 60
 """Nodes before the first step, and those of a stretch: the numbers of a full one are the next one's prior."""
 FORGOTTEN = 1.1
@@ -63,7 +60,6 @@ class SelfCalibration:
         self._state: Array | None = None
         self._work: Reduction | None = None
         self._reduced = False
-        self._misfit_before, self._unsettled = np.inf, 0
 
     def restart(self, known: Knowledge | None = None) -> None:
         """Begin a new stretch, as the path was interrupted; from `known` if what came since is wrong."""
@@ -126,8 +122,7 @@ class SelfCalibration:
 
     def _due(self) -> bool:
         fixes = len(self._drive.fix) + len(self._fixes)
-        early = self._now_s - self._stepped_s < STEP_S and not 0 < self._unsettled <= MOST_UNSETTLED
-        if early or min(len(self._first), fixes) < FEWEST_NODES:
+        if min(len(self._first), fixes) < FEWEST_NODES or self._now_s - self._stepped_s < STEP_S:
             return False
         standing = self._rolled_m == 0.0 and self._state is not None
         return not (standing and self._state is not None and len(self._state) == len(self._first))
@@ -141,8 +136,6 @@ class SelfCalibration:
             self._begin()
             return False
         self._state, self.known, self.misfit = work.part.state, found, work.misfit
-        unsettled = self.misfit < SETTLED * self._misfit_before
-        self._misfit_before, self._unsettled = self.misfit, self._unsettled + 1 if unsettled else 0
         if len(self._state) >= MOST_NODES:
             wider = dataclasses.replace(found, covariance=found.covariance * FORGOTTEN)
             limit = np.minimum(np.diag(wider.covariance), np.diag(self.prior.covariance))
