@@ -20,7 +20,7 @@ BLIND_FIGURES = {
     "unknown": "unknown recall", "false_unknown": "false unknown",
     "pairs": "both of a pair, each seen alone", "extras": "false extras a pair",
     "sizes": "size within 2 sigma", "shrink": "shrink over the oracle's",
-    "seconds": "seconds a data set, median",
+    "seconds": "CPU seconds a data set, median",
 }  # fmt: skip
 """Rows of the headline of `gap-blind`, by the name under which the page quotes them."""
 
@@ -443,18 +443,24 @@ STUDIES = (
     Study(
         "blind",
         "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
-        ("terrafusion", "gap-blind", "--share", "0.1", "--seed", "7", "--jobs", "2", "--out", OUT),
-        40,
+        (
+            "terrafusion",
+            "gap-blind",
+            "--share",
+            "0.25",
+            "--seed",
+            "28",
+            "--minutes",
+            "27",
+            "--no-opponent",
+            "--out",
+            OUT,
+        ),
+        35,
         {
             "trials": r"(\d+ of \d+) trials",
             "plant": r".* trials of plant (\w+)",
-            **{
-                f"{method}{figure}": rf"{name} {{2,}}"
-                + r"(?:\S+ )*\S+ {2,}" * column
-                + r"((?:\S+ )*?\S+)(?: {2,}|$)"
-                for column, method in enumerate(("", "opponent_"))
-                for figure, name in BLIND_FIGURES.items()
-            },
+            **{key: rf"{name} {{2,}}((?:\S+ )*?\S+)(?: {{2,}}|$)" for key, name in BLIND_FIGURES.items()},
         },
         "sheet.png",
     ),

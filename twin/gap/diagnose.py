@@ -16,7 +16,6 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.answer.drives import drive_coverage
 from terrafusion.twin.gap.answer.next_run import Planner
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
 from terrafusion.twin.gap.answer.verdict import judge
@@ -24,7 +23,9 @@ from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import Soils, check_distinct
 from terrafusion.twin.gap.infer.explain import explain
+from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import FEWEST, detect, learn_offsets
+from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.gap.null.score import REPLICATES, Score, learn_state_sigma, replicates, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
@@ -35,9 +36,9 @@ from terrafusion.twin.model.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-MANY_REFERENCES, STRICTER = 10, 0.2
-"""With fewer references, on drives unlike theirs, the p-value must be below such a share of the significance
-(assumed): how a run scatters is then hardly known."""
+STRICTER = 0.2
+"""On drives unlike the references', the p-value must be below such a share of the significance (assumed): how
+wrong laws are there is no more than assumed."""
 TOO_FEW = (
     "{} reference run(s) are too few, {} show how runs scatter: twin replicates stand in, and false alarms "
     "are as frequent as the twin is wrong (uncalibrated)"
@@ -119,21 +120,23 @@ def diagnose_evidence(
         notes.append(TOO_FEW.format(len(normal), FEWEST))
         normal = _with_replicates(evidence, sigma, normal, seed)
     robot = learn_offsets(normal, len(candidates.keys))
+    planner, judged = Planner.of(evidence, sigma, robot, scores), evidence
+    if not uncalibrated:
+        judged, robot = with_law_misfit(evidence, sigma, robot)
+        scores = [score(run, sigma) for run in judged.runs]
     # infer: is there a gap, and which effects explain it
     detection = detect(scores, robot, candidates, seed)
-    explanation = explain(evidence, sigma, robot, close=detection.p_value <= significance)
+    explanation = explain(judged, sigma, robot, close=detection.p_value <= significance)
     if progress is not None:
         progress(0.9)
     # answer: verdict, shrinkage, place, next run
     verdict = judge(detection, significance, explanation, candidates)
     drives = drive_coverage(runs, evidence.references, evidence.model)
     if drives is not None and drives.limits():
-        few = len(evidence.references) < MANY_REFERENCES
-        sure = not few or detection.p_value <= STRICTER * significance
-        verdict = verdict.where_drives_differ(sure)
-    shrunk = shrinkage(evidence, sigma, robot, verdict.fit)
-    where = gap_map(evidence, sigma, robot, seed)
-    following = Planner.of(evidence, sigma, robot, scores).next_run(verdict)
+        verdict = verdict.where_drives_differ(detection.p_value <= STRICTER * significance)
+    shrunk = shrinkage(judged, sigma, robot, verdict.fit)
+    where = gap_map(judged, sigma, robot, seed)
+    following = planner.next_run(verdict)
     return GapDiagnosis(
         vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,
         drives, evidence, tuple(notes), time.perf_counter() - began,

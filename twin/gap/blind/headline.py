@@ -34,7 +34,7 @@ TARGETS: tuple[tuple[str, str, Target | None], ...] = (
     ("false extras a pair", "pairs.extras", (0.0, 0.2)),
     ("size within 2 sigma", "sizes", (0.90, 0.98)),
     ("shrink over the oracle's", "shrink.over_oracle", (0.9, 1.1)),
-    ("seconds a data set, median", "seconds", (0.0, 8.0)),
+    ("CPU seconds a data set, median", "seconds", (0.0, 8.0)),
 )
 """Name, place among the figures, and its target; None: reported without one."""
 

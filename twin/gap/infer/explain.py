@@ -134,7 +134,7 @@ class _Explainer:
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
-        basis = np.arange(len(self.evidence.candidates.keys), m.shared)
+        basis = np.arange(len(self.evidence.candidates.keys), m.shared - self.robot.misfit)
         values, vectors = np.linalg.eigh(m.K[np.ix_(basis, basis)])
         square = np.square(UNKNOWN_SIZES)[:, None]
         grown = 1.0 + square * np.maximum(values, 0.0)

@@ -10,7 +10,6 @@ the judged drive have the same distribution, and the p-value is the rank among t
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,11 @@ PRIOR_COLUMNS = 8.0
 """Weight, in columns, of an offset's prior variance of one, the least. A larger one is learned, for the
 effects together and for the columns of each channel: where the twin is wrong on the references' drives, it
 may be as wrong on others."""
-EM_STEPS = 8
+EM_STEPS, MISFIT_STEPS = 8, 3
+MISFIT_SCATTER = 0.1  # prior 1 sigma from run to run of a coefficient of law misfit
+MISFIT_FREEDOM = (
+    4  # degrees of freedom of the scale of the misfit on other drives, which no reference shows (assumed)
+)
 JITTER = 0.02  # variance added to a standardised score: no combination of scores is taken as exact
 WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)  # 1 sigma of an effect's size, and of an unknown cause's
 TAIL_FREEDOM = 10  # degrees of freedom of the tail of the statistic: heavier than normal (assumed)
@@ -47,6 +50,9 @@ class RobotOffsets:
         scatter: (P,) variance from run to run.
         prior: (P,) variance of the columns before the references.
         references: number of them.
+        misfit: number of the last columns that are of the misfit of laws.
+        changed: variance by which their coefficients on the judged drives differ from those on the
+            references'.
     """
 
     mean: Array
@@ -54,11 +60,13 @@ class RobotOffsets:
     scatter: Array
     prior: Array
     references: int
+    misfit: int = 0
+    changed: float = 0.0
 
     def of(self, references: Sequence[Score]) -> RobotOffsets:
         """What some references know, with the same scatter and prior."""
         mean, covariance, _ = _posterior(references, self.scatter, self.prior)
-        return dataclasses.replace(self, mean=mean, covariance=covariance, references=len(references))
+        return RobotOffsets(mean, covariance, self.scatter, self.prior, len(references), self.misfit)
 
 
 def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
@@ -77,6 +85,26 @@ def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
             mine = group == k
             prior[mine] = max((PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + mine.sum()), 1.0)
     return RobotOffsets(mean, covariance, scatter, prior, count)
+
+
+def learn_misfit(
+    references: Sequence[Score], offsets: RobotOffsets, sigma: float, changed: float
+) -> RobotOffsets:
+    """Offsets with further columns of law misfit, which all scores have behind those of `offsets`.
+
+    Args:
+        sigma: 1 sigma of their coefficients before the references.
+        changed: variance by which they differ on the judged drives.
+    """
+    count = len(references[0].b) - len(offsets.mean)
+    first = np.append(offsets.scatter, np.full(count, MISFIT_SCATTER**2))
+    prior, scatter = np.append(offsets.prior, np.full(count, sigma**2)), first
+    mean, covariance = np.zeros(len(first)), np.eye(len(first))
+    for _ in range(MISFIT_STEPS):
+        mean, covariance, square = _posterior(references, scatter, prior)
+        scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + len(references))
+    covariance = covariance + np.diag(np.append(np.zeros(len(offsets.mean)), np.full(count, changed)))
+    return RobotOffsets(mean, covariance, scatter, prior, len(references), count, changed)
 
 
 def _posterior(references: Sequence[Score], scatter: Array, prior: Array) -> tuple[Array, Array, Array]:
@@ -112,11 +140,13 @@ def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates,
 
     A = np.sum([r.A for r in runs], axis=0)
     spread = A @ offsets.covariance @ A + A + sum((r.A * offsets.scatter) @ r.A for r in runs)
-    squares = _deviations(A, spread, candidates)
-    others = squares(_replicates(runs, A, offsets, np.random.default_rng(seed)))
+    own = len(A) - offsets.misfit  # no law misfit is a finding
+    squares = _deviations(A[:own, :own], spread[:own, :own], candidates)
+    others = squares(_replicates(runs, A, offsets, np.random.default_rng(seed))[:, :own])
     typical = np.maximum(others.mean(axis=0), LEAST_SQUARE)
     greatest = (others / typical).max(axis=1)
-    found = (squares((np.sum([r.b for r in runs], axis=0) - A @ offsets.mean)[None]) / typical).max()
+    pooled = np.sum([r.b for r in runs], axis=0) - A @ offsets.mean
+    found = (squares(pooled[None, :own]) / typical).max()
     p_value = float((1 + np.count_nonzero(greatest >= found)) / (1 + len(greatest)))
     if found > greatest.max():
         others = np.log(greatest)
@@ -128,7 +158,14 @@ def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates,
 def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.random.Generator) -> Array:
     """Pooled scores (R, P) less their mean; the scatter from run to run is itself known from few runs."""
     P, size = len(A), (REPLICATES, len(A))
-    robot = rng.standard_normal(size) @ np.linalg.cholesky(offsets.covariance + 1e-12 * np.eye(P)).T
+    known = offsets.covariance + 1e-12 * np.eye(P)
+    known[np.diag_indices(P)] -= np.append(
+        np.zeros(P - offsets.misfit), np.full(offsets.misfit, offsets.changed)
+    )
+    robot = rng.standard_normal(size) @ np.linalg.cholesky(known).T
+    if offsets.changed > 0.0:
+        scale = np.sqrt(offsets.changed * MISFIT_FREEDOM / rng.chisquare(MISFIT_FREEDOM, (REPLICATES, 1)))
+        robot[:, P - offsets.misfit :] += scale * rng.standard_normal((REPLICATES, offsets.misfit))
     values, vectors = np.linalg.eigh(A)
     noise = rng.standard_normal(size) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     freedom = float(offsets.references)

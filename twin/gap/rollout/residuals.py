@@ -121,6 +121,20 @@ class WhitenedRun:
         """(n, P) columns of the effects and the nuisance basis."""
         return self.rows[:, self.states : -1].astype(float)
 
+    def with_columns(self, columns: Array) -> WhitenedRun:
+        """With further whitened columns (n, D) behind those of effects and nuisance."""
+        rows = np.column_stack([self.rows[:, :-1], columns.astype(np.float32), self.rows[:, -1]])
+        old, inner = self.rows.shape[1] - 1, rows.astype(float).T @ columns
+        gram = np.insert(
+            np.insert(self.gram, old, np.zeros((columns.shape[1], 1)), axis=0),
+            [old] * columns.shape[1],
+            0.0,
+            axis=1,
+        )
+        new = np.arange(old, old + columns.shape[1])
+        gram[:, new], gram[new] = inner, inner.T
+        return dataclasses.replace(self, rows=rows, gram=gram)
+
     def state_information(self, sigma: Array) -> Array:
         """(T, T) information of the states with their prior of 1 sigma (T,)."""
         return self.gram[: self.states, : self.states] + np.diag(sigma**-2.0)

@@ -11,6 +11,7 @@ from terrafusion.twin.gap.infer.other_drives import (
     CANDIDATE_SCATTER,
     NUISANCE_SCATTER,
     detect,
+    learn_misfit,
     learn_offsets,
 )
 from terrafusion.twin.gap.null.score import Score
@@ -82,6 +83,37 @@ def test_what_references_do_not_show_counts_as_unknown() -> None:
     assert offsets.covariance[hidden, hidden] == pytest.approx(1.0)
     robot[hidden] = 1.0
     assert detect(scores(rng, 1, "other", robot), offsets, CANDIDATES, 0).p_value > 0.05
+
+
+def _where_laws_differ(seed: int, known: bool) -> float:
+    """p-value on the other drive, where two modulated laws act on it otherwise than on the references'."""
+    rng, sigma = np.random.default_rng(seed), 3.0
+    modulated = {k: J[:, :2] * np.linspace(-1.0, 1.0, ROWS)[:, None] for k, J in DRIVES.items()}
+    robot, own = rng.standard_normal(P), sigma * rng.standard_normal(2)
+    there = {"reference": own, "other": own + sigma * rng.standard_normal(2)}
+
+    def some(count: int, drive: str) -> list[Score]:
+        J, out = np.column_stack([DRIVES[drive], modulated[drive]]), []
+        for _ in range(count):
+            run = robot + SCATTER * rng.standard_normal(P)
+            error = rng.standard_normal(ROWS) + J @ np.append(run, there[drive])
+            out.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+        return out
+
+    def plain(runs: list[Score]) -> list[Score]:
+        return [Score(r.b[:P], r.A[:P, :P], r.square, r.samples) for r in runs]
+
+    references, runs = some(12, "reference"), some(1, "other")
+    offsets = learn_offsets(plain(references), len(CANDIDATES.keys))
+    if not known:
+        return detect(plain(runs), offsets, CANDIDATES, seed).p_value
+    return detect(runs, learn_misfit(references, offsets, sigma, sigma**2), CANDIDATES, seed).p_value
+
+
+def test_laws_that_act_otherwise_on_another_drive_are_no_gap() -> None:
+    found = {known: np.array([_where_laws_differ(i, known) for i in range(60)]) for known in (True, False)}
+    assert (found[True] <= 0.05).mean() <= 0.12
+    assert (found[False] <= 0.05).mean() > 0.3
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:

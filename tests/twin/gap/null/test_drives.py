@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.gap.answer.drives import coverage
+from terrafusion.twin.gap.null.drives import coverage, overlap
 
 
 def steady(speed: float, turn: float, seconds: float) -> np.ndarray:
@@ -30,3 +30,13 @@ def test_what_references_never_drove_is_named_with_its_time() -> None:
 def test_a_moment_does_not_cover() -> None:
     found = coverage([steady(0.9, 0.0, 10.0)], [steady(0.9, 0.0, 0.5)])
     assert found.covered == pytest.approx(0.0)
+
+
+def test_overlap_is_beside_that_of_the_references_themselves() -> None:
+    slow, fast = steady(0.3, 0.0, 20.0), steady(0.9, 0.0, 20.0)
+    both = np.concatenate([slow, fast])
+    assert overlap([both], [both, both, both]) == pytest.approx(1.0, abs=0.02)
+    assert overlap([fast], [both, both, both]) == pytest.approx(0.5, abs=0.03)
+    assert overlap([fast], [slow, slow, slow]) < 0.05
+    mixed = [slow, fast, slow, fast]  # they differ among themselves
+    assert overlap([fast], mixed) > overlap([fast], [both] * 4)

@@ -80,6 +80,23 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
     return DriveCoverage(1.0 - sum(lacking.values()) / max(total, 1e-9), tuple(listed[:MOST_LISTED]))
 
 
+def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
+    """Share of the commands, by time, that runs and references have in common, over that of as many of the
+    references with the rest, at most one; twists as for `coverage`."""
+    size = min(len(runs), len(references) // 2)
+    own = [
+        _in_common(references[i : i + size], [*references[:i], *references[i + size :]])
+        for i in range(0, len(references) - size + 1, max(size, 1))
+    ]
+    return min(_in_common(runs, references) / max(float(np.mean(own)), 1e-9), 1.0) if size else 1.0
+
+
+def _in_common(runs: Sequence[Array], others: Sequence[Array]) -> float:
+    a, b = _summed(runs), _summed(others)
+    total, of_others = sum(a.values()), sum(b.values())
+    return sum(min(seconds / total, b.get(cell, 0.0) / of_others) for cell, seconds in a.items())
+
+
 def _summed(twists: Sequence[Array]) -> dict[Cell, float]:
     out = dict[Cell, float]()
     for twist in twists:
