@@ -30,6 +30,7 @@ from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.calibration import Head, calibration_head, probabilities
 from terrafusion.twin.gap.infer.explain import Explanation, explain
+from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import detect, learn_offsets
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
@@ -170,6 +171,7 @@ def make(number: int, jobs: int = 1) -> dict[str, Any]:
         evidence = gather_evidence(runs, references, load_vehicle(of.robot), of.soil, candidates, jobs=jobs)
         sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
         robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+        evidence, robot = with_law_misfit(evidence, sigma, robot)
         found = detect([score(r, sigma) for r in evidence.runs], robot, candidates, 0)
         seen, out = found.p_value <= SIGNIFICANCE, {"number": number, "truth": of.changes, "p": found.p_value}
         left = {"known": ()}

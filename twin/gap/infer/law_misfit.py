@@ -67,5 +67,5 @@ def _columns(run: WhitenedRun, model: Model, offset: Array, groups: Sequence[Seq
     predicted, parts = columns @ offset, [columns[:, g] @ offset[g] for g in groups if g]
     names = np.array([CHANNEL_NAMES[o.channel] for o in run.log.observed])
     parts += [predicted * (names[run.channel] == name) for name in dict.fromkeys(names)]
-    f = np.column_stack([np.ones(len(predicted)), modulation(run, model)])
+    f = modulation(run, model)  # without a constant, which would be the offset itself
     return np.hstack([part[:, None] * f for part in parts])
