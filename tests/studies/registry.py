@@ -288,6 +288,7 @@ STUDIES = (
         }
         | {
             "over_ekf": r"adaptive / EKF, vehicle of the log: ([\d.]+)",
+            "over_ekf_interval": r"adaptive / EKF, vehicle of the log: ([\d.]+ \[[\d.]+, [\d.]+\])",
             "lost_to_ekf": r"adaptive / EKF, vehicle of the log: .*lost (\d+ of \d+)",
         },
         "opponents.png",
@@ -341,6 +342,7 @@ STUDIES = (
             f"{group}_adaptive": rf"{group}, adaptive over fixed: ([\d.]+) "
             for group in ("slipping", "firm", "all", "ice", "loose_sand", "gravel", "grass")
         }
+        | {"slipping_interval": r"slipping, adaptive over fixed: ([\d.]+ \[[\d.]+, [\d.]+\])"}
         | {
             f"memory_{ground}_right": rf"memory on {ground}: right (\d+ %)"
             for ground in ("asphalt", "grass", "gravel", "ice", "loose_sand")
