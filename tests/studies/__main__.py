@@ -74,7 +74,7 @@ def keep(study: Study, printed: str, seconds: float, out: Path) -> None:
     file = RESULTS / f"{study.name}.json"
     before = json.loads(file.read_text(encoding="utf-8"))["figures"] if file.is_file() else {}
     if lost := sorted(set(before) - set(figures)):
-        raise SystemExit(f"{study.name}: no pattern of registry.py gives {', '.join(lost)}; add one first")
+        raise SystemExit(f"{study.name}: no pattern of the registry gives {', '.join(lost)}; add one first")
     result = {
         "study": study.name,
         "question": study.question,

@@ -1,0 +1,216 @@
+"""Studies of the estimator: errors in outages, modes, grounds, consistency, speed."""
+
+from __future__ import annotations
+
+from tests.studies.study import OUT, Study, module
+
+ESTIMATOR = (
+    Study(
+        "demo_seeds",
+        "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",
+        module("demo_seeds", "--seeds", "10"),
+        12,
+        {
+            f"{drive}_{mode}_{what}": rf"{drive} +{mode}" + r" +[\d.]+" * i + r" +([\d.]+)"
+            for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
+            for mode in ("fixed", "adaptive")
+            for i, what in enumerate(("ate_m", "median_m", "end_m"))
+        }
+        | {
+            f"{drive}_ratio": rf"{drive}, adaptive over fixed at the end: ([\d.]+ \[[\d.]+, [\d.]+\])"
+            for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
+        },
+    ),
+    Study(
+        "outage_causes",
+        "What makes the error at the end of the demo's outage, and of mixed ground in the benchmark?",
+        module("outage_causes", "--arms", "fixed;adaptive"),
+        8,
+        {f"{f}_ratio": rf"{f} adaptive +[\d.]+ +([\d.]+ \[[\d.]+, [\d.]+\])" for f in ("demo", "mixed")},
+    ),
+    Study(
+        "estimator_speed",
+        "How long does the estimator compute, live and in batch, beside GTSAM's own optimisers?",
+        module("speed.speed"),
+        3,
+    ),
+    Study(
+        "slip",
+        "How far off is the estimated slip, and how late is immobilisation seen?",
+        module("slip_trials"),
+        30,
+        {
+            f"{ground}_{what}": rf" *{ground} \d+ deg:" + (r" [\d.]+," if i else "") + r" ([\d.]+)"
+            for ground in ("mud", "loose_sand", "medium_sand", "asphalt")
+            for i, what in enumerate(("filtered", "smoothed"))
+        },
+    ),
+    Study(
+        "calibration_states",
+        "Does the estimator find wrong numbers of the vehicle file while it drives?",
+        module("calibration_trials"),
+        20,
+    ),
+    Study(
+        "twin_consistency",
+        "Are NEES and NIS in their bands on every ground of the twin?",
+        module("twin_consistency"),
+        15,
+    ),
+    Study(
+        "field_table",
+        "How do the modes compare on every field log, with fixes and in outages?",
+        module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
+        240,
+        picture="field_table.png",
+    ),
+    Study(
+        "opponents",
+        "Are errors in outages smaller than those of an EKF, a GTSAM smoother and an INS, tuned alike?",
+        module("opponents.table", "--out", OUT, "--jobs", "2"),
+        240,
+        {
+            f"{mode}_{what}_{seconds}_s": rf"{mode}, {known}, {seconds} s: ([\d.]+)"
+            for mode in ("fixed", "adaptive")
+            for what, known in (("log", "vehicle of the log"), ("unknown", "wheel radius and track alone"))
+            for seconds in (10, 30, 60)
+        }
+        | {
+            "over_ekf": r"adaptive / EKF, vehicle of the log: ([\d.]+)",
+            "over_ekf_interval": r"adaptive / EKF, vehicle of the log: ([\d.]+ \[[\d.]+, [\d.]+\])",
+            "lost_to_ekf": r"adaptive / EKF, vehicle of the log: .*lost (\d+ of \d+)",
+        },
+        "opponents.png",
+    ),
+    Study(
+        "unseen_robots",
+        "Are errors in outages smaller than a plain EKF's on robots that no part of the library made?",
+        module("unseen_robots.study", "--out", OUT),
+        15,
+        {
+            f"{mode}_{seconds}_s": rf"{mode} over EKF, {seconds} s: ([\d.]+ \[[\d.]+, [\d.]+\])"
+            for mode in ("fixed", "adaptive")
+            for seconds in (10, 30)
+        }
+        | {
+            f"{mode}_{seconds}_s_lost": rf"{mode} over EKF, {seconds} s: .* lost (\d+ of \d+)"
+            for mode in ("fixed", "adaptive")
+            for seconds in (10, 30)
+        }
+        | {
+            f"inside_{seconds}_s": rf"adaptive over EKF, {seconds} s: .* ellipses (\d+ %)"
+            for seconds in (10, 30)
+        }
+        | {
+            f"{number}_held": rf"{number}: within 2 sigma (\d+ of \d+)"
+            for number in ("antenna_x_m", "gnss_delay_s", "imu_yaw_rad", "wheel_scale")
+        },
+    ),
+    Study(
+        "coarse_slides",
+        "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
+        module("coarse_slides"),
+        5,
+        {
+            "judged": r"judged: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
+            "developed": r"developed: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
+        },
+    ),
+    Study(
+        "outage_terms",
+        "Which term of dead reckoning are errors after 10 s without fixes made of?",
+        module("opponents.decompose"),
+        5,
+    ),
+    Study(
+        "grounds",
+        "What does adaptive mode gain in outages on logs of one robot, and does memory know its grounds?",
+        module("grounds"),
+        8,
+        {
+            f"{group}_adaptive": rf"{group}, adaptive over fixed: ([\d.]+) "
+            for group in ("slipping", "firm", "all", "ice", "loose_sand", "gravel", "grass")
+        }
+        | {"slipping_interval": r"slipping, adaptive over fixed: ([\d.]+ \[[\d.]+, [\d.]+\])"}
+        | {
+            f"memory_{ground}_right": rf"memory on {ground}: right (\d+ %)"
+            for ground in ("asphalt", "grass", "gravel", "ice", "loose_sand")
+        },
+    ),
+    Study(
+        "ground_changes",
+        "How soon is a change of ground noticed, and named, by a classifier of the robot's own grounds?",
+        module("ground_changes"),
+        3,
+        {
+            "macro_f1": r"macro-F1 ([\d.]+)",
+            "ece": r"macro-F1 [\d.]+, ECE ([\d.]+)",
+            "alarm_within_2_s": r"alarm within 2 s: (\d+ ?%)",
+            "false_alarms": r"false alarms a minute: ([\d.]+)",
+            "named_within_2_s": r"new ground named within 2 s: (\d+ ?%)",
+            "named_after_s": r"new ground named after, median: ([\d.]+)",
+        },
+    ),
+    Study(
+        "slip_model",
+        "Can wheels and IMU alone predict slip on a robot, soil or data set that nothing was fitted to?",
+        module("slip_model.study"),
+        5,
+        {
+            "drives": r"(\d+) drives of the twin",
+        }
+        | {
+            f"fresh_{what}": r"twin, fresh drives +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+        }
+        | {
+            f"{robot}_{what}": rf"real, {robot} +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for robot in ("warthog", "husky", "pathfinder")
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+        }
+        | {
+            f"memory_{what}": r"own past, warthog +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
+            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+        }
+        | {
+            f"slippery_{source}": rf"twin to {source} +\d+ runs: balanced accuracy [\d.]+ by window, ([\d.]+)"
+            for source in ("norlab_drive", "borealtc")
+        },
+    ),
+    Study(
+        "slippery",
+        "Is slippery ground told from firm on a robot left out, by features relative to the robot itself?",
+        module("slip_model.slippery"),
+        4,
+        {
+            f"{fit.split()[0]}_{source}": rf"{fit} to {source} +\d+ runs: .* by window, ([\d.]+) by run"
+            for source in ("norlab_drive", "borealtc")
+            for fit in ("twin", "other robot", "both")
+        },
+    ),
+    Study(
+        "known_changes",
+        "What do known changes in real logs cost an estimator that is not told, and do ellipses hold?",
+        module("known_changes.table", "--out", OUT, "--jobs", "2"),
+        240,
+        {"ratio": r"all changes, not told: ([\d.]+)"},
+        "known_changes.png",
+    ),
+    Study(
+        "benchmark",
+        "What do adaptive weights gain over fixed and other baselines, in pairs of the same drives?",
+        ("terrafusion", "benchmark", "--out", OUT),
+        300,
+        {
+            f"{family}_{plant}_over_fixed": rf"\| {family}, {plant} (?:\|[^|]*){{5}}\| ([^|]+?) \|"
+            for family, plant in (("mixed", "twin"), ("mixed", "second"), ("unseen", "second"))
+        },
+        picture="ratios.png",
+    ),
+    Study(
+        "detector",
+        "How well are grounds told apart, on fresh drives, with sensors missing, on grounds never seen?",
+        ("terrafusion", "terrain", "eval"),
+        20,
+    ),
+)
