@@ -97,6 +97,7 @@ def test_the_table_compares_with_the_filter() -> None:
         Result("one", 10.0, name, 4, error, 1.0, inside)
         for name, error, inside in ((EKF, 2.0, None), (MODES[0], 1.0, 0.9), (MODES[1], 3.0, 1.0))
     ]
+    results += [Result("slow", 10.0, name, 0, np.nan, np.nan, None) for name in (EKF, *MODES)]
     lines = table(results)
     assert "fixed over EKF, 10 s: 0.50, lost 0 of 1, worst 0.50, inside 95 % ellipses 90 %" in lines
     assert "adaptive over EKF, 10 s: 1.50, lost 1 of 1, worst 1.50, inside 95 % ellipses 100 %" in lines

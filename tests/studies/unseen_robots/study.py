@@ -130,12 +130,13 @@ def _result(
 ) -> Result:
     errors = np.array([row.error_m for row in rows])
     percent = 100.0 * errors / np.array([row.distance_m for row in rows])
-    medians = float(np.median(errors)), float(np.median(percent))
+    medians = (float(np.median(errors)), float(np.median(percent))) if rows else (math.nan, math.nan)
     return Result(robot, seconds, estimator, len(rows), *medians, float(np.mean(shares)) if shares else None)
 
 
 def table(results: Sequence[Result]) -> list[str]:
-    """A line a robot and length, then the summary."""
+    """A line a robot and length, then the summary; slow robots have no outage with a path to score."""
+    results = [result for result in results if result.outages]
     lines = [
         f"{'robot':28s} {'s':>3s} outages   EKF, m  "
         + "  ".join(f"{m + ', m':>11s}  ratio  inside" for m in MODES)
