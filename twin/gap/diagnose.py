@@ -119,10 +119,11 @@ def diagnose_evidence(
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
         normal = _with_replicates(evidence, sigma, normal, seed)
-    robot = learn_offsets(normal, len(candidates.keys))
-    planner, judged = Planner.of(evidence, sigma, robot, scores), evidence
+    offsets = learn_offsets(normal, len(candidates.keys))
+    planner = Planner.of(evidence, sigma, offsets, scores)
+    judged, robot = evidence, offsets
     if not uncalibrated:
-        judged, robot = with_law_misfit(evidence, sigma, robot)
+        judged, robot = with_law_misfit(evidence, sigma, offsets)
         scores = [score(run, sigma) for run in judged.runs]
     # infer: is there a gap, and which effects explain it
     detection = detect(scores, robot, candidates, seed)
@@ -135,7 +136,7 @@ def diagnose_evidence(
     if drives is not None and drives.limits():
         verdict = verdict.where_drives_differ(detection.p_value <= STRICTER * significance)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit)
-    where = gap_map(judged, sigma, robot, seed)
+    where = gap_map(evidence, sigma, offsets, seed)  # the misfit of laws would hide the place
     following = planner.next_run(verdict)
     return GapDiagnosis(
         vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,

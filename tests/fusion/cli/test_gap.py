@@ -52,7 +52,7 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     assert max(map(len, lines)) <= 100
     titles = [line.split()[0] for line in lines[1:] if not line.startswith(" ")]
     assert [t for t in titles if t[0].isupper()] == ["Where", "Which", "Shrinks", "Next", "Load", "Details"]
-    assert re.search(r" while .*: [0-9.]+ (m|rad/s) \([0-9.]+ sigma\), references", done.out), done.out
+    assert re.search(r" while .*: [0-9.]+ m \([0-9.]+ sigma\), references", done.out), done.out
     assert "Push the robot ten turns" in " ".join(done.out.split())
     assert f"--vehicle {tmp_path / 'corrected.yaml'}" in " ".join(done.out.split())
     assert "wheel.radius_m" not in done.out
