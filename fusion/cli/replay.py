@@ -98,8 +98,7 @@ def replay(
     from terrafusion.fusion.grounds.file import read_grounds, save_grounds
     from terrafusion.fusion.metrics.scores import parse_outage
     from terrafusion.fusion.replay import replay as run
-    from terrafusion.fusion.reports.replay import write_replay
-    from terrafusion.fusion.reports.rerun_log import require_rerun, write_rerun
+    from terrafusion.fusion.reports.rerun_log import require_rerun
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
@@ -127,20 +126,24 @@ def replay(
         )
     if grounds is not None and result.grounds is not None:
         save_grounds(result.grounds, grounds)
+    unseen = _write(result, out, mcap, rerun)
+    warnings = [_warning(finding, result.learned) for finding in findings]
+    lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
+    done = f"written to {out}"
+    short = f"{result.verdict.lines()[0]}; {done}"
+    return Result(lines, done, read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
+
+
+def _write(result: ReplayResult, out: Path, mcap: bool, rerun: Path | None) -> list[str]:
+    """All files of a replay; returns lines on what the bag could not hold."""
+    from terrafusion.fusion.reports.replay import write_replay
+    from terrafusion.fusion.reports.rerun_log import write_rerun
+
     write_replay(out, result, {"command": command_line()})
     unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
-    warnings = [_warning(finding, result.learned) for finding in findings]
-    lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
-    done = f"written to {out}"
-    return Result(
-        lines,
-        done,
-        read_json(out / "metrics.json"),
-        short=f"{result.verdict.lines()[0]}; {done}",
-        vehicle=result.vehicle,
-    )
+    return unseen
 
 
 def _warning(finding: Finding, learned: Sequence[NumberAfterDrive]) -> str:

@@ -25,7 +25,8 @@ SLIP_RENEWAL = 1.1
 """Where the wheels change their speed by a share x, `SLIP_RENEWAL x^2` of the slip is new, as traction
 changes with speed (tuned)."""
 MOST_SWITCH = 0.98
-"""A change that is certain leaves this share of the old slip to be told: it may have been anywhen."""
+"""Largest share of the slip that a detected change of ground renews: spread over keyframes, a change that is
+certain would renew all of it at each of them."""
 GROUND_STATES = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
 """What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
