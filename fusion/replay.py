@@ -1,7 +1,5 @@
 """Replay a recording through the estimator as it would have run live, and score it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ joblib's loky and a Dask client both offer the executor of `concurrent.futures`,
 same code, and that the loss of all workers is noticed while waiting (joblib's own Dask backend would wait).
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging

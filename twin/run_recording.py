@@ -1,7 +1,5 @@
 """The recording of a simulated run: every sensor at its own rate, the truth, and how it was made."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

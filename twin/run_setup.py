@@ -1,7 +1,5 @@
 """A simulated run before its sensors: vehicle, ground and commands, checked and ready to be driven."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

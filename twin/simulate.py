@@ -1,7 +1,5 @@
 """`simulate`: one drive of the twin, as a `Recording` with truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -7,8 +7,6 @@ The library carries no recording: `TERRAFUSION_DATA` names a folder that holds t
 are downloaded (`fetch`).
 """
 
-from __future__ import annotations
-
 import csv
 import fnmatch
 import functools

@@ -3,8 +3,6 @@
 This module imports requests and pooch: import it where it is used.
 """
 
-from __future__ import annotations
-
 import difflib
 import logging
 import shutil

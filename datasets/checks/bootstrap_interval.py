@@ -1,7 +1,5 @@
 """An estimated number with its interval, as findings report it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

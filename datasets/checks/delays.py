@@ -1,7 +1,5 @@
 """Clocks compared with each other: gaps, jumps, drifts, and constant delays between sensors."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

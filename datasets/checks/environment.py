@@ -1,7 +1,5 @@
 """Barometer and magnetometer: units, range, hard iron. No finding is an error: both are optional."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

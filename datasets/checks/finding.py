@@ -1,7 +1,5 @@
 """Types shared by the log checks, and building blocks of their repairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field

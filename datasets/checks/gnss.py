@@ -1,7 +1,5 @@
 """The fixes: their classes, jumps and repeats."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The frame and unit of the fixes: metres or degrees, and velocities against differenced positions."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ to the east and to the north, and twice it for the height (the public NMEA drive
 into the covariance). It describes the geometry of the satellites, not metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

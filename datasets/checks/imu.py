@@ -4,8 +4,6 @@ Gravity shows which axis points up; the specific force along and across the path
 times yaw rate) which one points forward; gyro and wheels whether the gyro shares the accelerometer's axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

@@ -3,8 +3,6 @@
 Several recordings of one robot are pooled: windows of 2 s rarely suffice alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Fixes whose path is the mirror image of that of wheels and gyro, where courses are too coarse to say."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Sources of yaw are gyro z, wheels (right minus left speed, m/s), truth and comma
 GNSS, truth and command. Each keeps its own clock.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Single values that a sensor cannot have measured: saturation and spikes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

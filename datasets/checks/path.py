@@ -5,8 +5,6 @@ least squares, in the plane as complex numbers with one factor for scale and rot
 slip, a wrong radius and wrong units.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ scale of the gyro about z and the lever arm of the antenna. They are found by Ga
 weights, their intervals by bootstrap over windows: errors of fixes last for many seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Values and durations that no ground robot reaches: a wrong unit, or corrupt data."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

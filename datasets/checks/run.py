@@ -1,7 +1,5 @@
 """Run all checks on a recording, and apply the repairs they offer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

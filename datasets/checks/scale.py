@@ -2,8 +2,6 @@
 yaw of the truth, else against the shape of the measured path.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

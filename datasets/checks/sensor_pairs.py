@@ -3,8 +3,6 @@
 The command is not among them: the robot follows it with a delay.
 """
 
-from __future__ import annotations
-
 from terrafusion.datasets.checks.finding import CheckContext, period_s
 from terrafusion.datasets.checks.motion import Signal, speeds, yaw_rates
 from terrafusion.datasets.core.lag import Lag, lag_between

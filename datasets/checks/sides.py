@@ -1,7 +1,5 @@
 """Left against right: sides sampled at different times, and one wheel smaller than the other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Signals that a sensor cannot have produced: held values, stuck or dead axes, missing cells."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Wheels that roll while the robot stands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Numbers are in the unit of their key; None (null) is unknown. The keys are descr
 docs/reference/conventions.md.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """Each clock by itself: span, rate, coarse stamps, jitter, gaps, repeats, steps removed on reading."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence

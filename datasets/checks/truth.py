@@ -1,7 +1,5 @@
 """The truth: its yaw against its own course, its unit against the wheels."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """The wheels compared with each other, and their sign compared with the motion of the robot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 

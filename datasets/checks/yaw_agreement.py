@@ -3,8 +3,6 @@
 Where two contradict each other, the smallest set of sources whose reversal makes all agree is at fault.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations, product

@@ -1,7 +1,5 @@
 """Types of arrays, and arrays of texts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ warmer than the standard a computed height difference is the true one times T_st
 each 10 K; the weather shifts all heights by 0.083 m/Pa at sea level.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -3,8 +3,6 @@
 Own lines in place of `scipy.stats.bootstrap`: its import is slow, and it refuses samples of one unit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

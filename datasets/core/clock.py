@@ -5,8 +5,6 @@ all later times so that the interval at the step is the nominal one; the repaire
 than a sampling period. Messages that arrived out of order have correct times; `in_order` sorts them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

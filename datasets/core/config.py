@@ -5,8 +5,6 @@ errors of a file (unknown or missing keys, wrong types, numbers out of range) ar
 each: file, key, value and what is allowed. `schema` gives the JSON schema of a kind of file, for editors.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import functools

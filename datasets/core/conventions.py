@@ -4,8 +4,6 @@ A reader returns the numbers of its file; `apply` converts them to the conventio
 of a public data set are in the catalogue, each with its source; every applied one becomes a note.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 from typing import Annotated

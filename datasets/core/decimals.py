@@ -1,7 +1,5 @@
 """Exact, vectorised conversion of decimal and ISO 8601 times to integer nanoseconds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 

@@ -1,7 +1,5 @@
 """How results show themselves in a notebook."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 

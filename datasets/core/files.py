@@ -1,7 +1,5 @@
 """Atomic writing of files, and checks of output folders."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable

@@ -8,8 +8,6 @@ has rotation first and is expressed in the body; ROS has translation first and
 is expressed in the parent frame. `gtsam_to_ros_covariance` converts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -3,8 +3,6 @@
 x(t + dt) = decay x(t) + spread sigma w with unit white noise w (Uhlenbeck and Ornstein 1930, Phys. Rev. 36).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """GPS time and UTC: the leap seconds between them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Pauses of Python's collector of cycles while messages are processed."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 from collections.abc import Iterator

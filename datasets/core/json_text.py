@@ -1,7 +1,5 @@
 """Strict JSON: numbers that are not finite are null."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Lag between two signals on different clocks, by cross-correlation, with its interval."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

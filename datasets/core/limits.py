@@ -4,8 +4,6 @@ Limits count what comes out of a file (bytes unpacked, rows, columns, values), s
 unpack to any amount. They leave room for an IMU of 400 Hz for three hours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Arrays are views into the channels. Units and frames are those of the channel of the same name in `recording`.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

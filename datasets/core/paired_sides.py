@@ -1,7 +1,5 @@
 """Wheels whose sides are sampled at different times, brought to common times."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

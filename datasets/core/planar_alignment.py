@@ -1,7 +1,5 @@
 """Least-squares alignment of points in the plane; points are complex numbers, east + i north."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Complex

@@ -1,7 +1,5 @@
 """Text of foreign origin (names of files, channels and logs) as a terminal may show it."""
 
-from __future__ import annotations
-
 import re
 
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -8,8 +8,6 @@ robot:
   gnss_delay_s: {value: 0.21, known: calibrated, sigma: 0.01, logs: [monday, tuesday]}
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any

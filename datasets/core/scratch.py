@@ -1,7 +1,5 @@
 """Private folders for work in progress; those that a killed process left are removed by a later one."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -4,8 +4,6 @@ Field logs are often one long run, while the diagnosis compares several: `LOG@60
 to 105 s after the log's start, `LOG@/45` are all consecutive segments of 45 s.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re

@@ -5,8 +5,6 @@ Noise densities follow the Allan-variance convention (IEEE Std 952-1997): the
 standard deviation of a rate averaged over tau is density / sqrt(tau).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

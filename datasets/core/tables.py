@@ -1,7 +1,5 @@
 """Tables as text and as Markdown, and numbers in them. Cells are strings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 

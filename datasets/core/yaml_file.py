@@ -5,8 +5,6 @@ Refused are what would hang a reader or hide a mistake: double keys, merge keys 
 nesting, and aliases that stand for very many values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

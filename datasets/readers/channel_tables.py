@@ -1,7 +1,5 @@
 """Tables with the columns of the log folder -> channels of a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol

@@ -4,8 +4,6 @@ The parsing is pandas' C parser; the cells of every line are counted first, beca
 lines and cuts long ones silently.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 import io

@@ -1,7 +1,5 @@
 """The formats that can be read: which module recognises a file and reads it (how to add one: `readers`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module

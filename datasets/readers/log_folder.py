@@ -4,8 +4,6 @@ An absent file is an absent channel, an empty cell a missing value. Anything
 else that is not a number is an error: this reader never guesses.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from collections.abc import Iterator, Mapping, Sequence

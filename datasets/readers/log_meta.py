@@ -3,8 +3,6 @@
 Known keys are read strictly, any others are kept as they are and named in one remark.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from collections.abc import Mapping

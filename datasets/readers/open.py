@@ -1,7 +1,5 @@
 """`open_recording` and `open_recordings`: every format by one function."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from pathlib import Path

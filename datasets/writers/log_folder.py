@@ -1,7 +1,5 @@
 """Write a recording as a log folder; reading it back gives the same recording to the bit."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

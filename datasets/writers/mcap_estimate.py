@@ -1,7 +1,5 @@
 """An estimate beside a recording in a bag: odometry, transform and diagnostics, as ROS 2 messages."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

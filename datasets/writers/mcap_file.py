@@ -4,8 +4,6 @@ Records are those of the `mcap` library; chunks are filled here, thousands of me
 its writer takes one message at a time: 4 times as long.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

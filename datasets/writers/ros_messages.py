@@ -3,8 +3,6 @@
 Every function takes rows that a message can hold: the caller leaves the others out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A recording as the tables and the `meta.yaml` keys of the log folder, for all writers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """TUM trajectory files (read by `readers.text.tum`)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -12,8 +12,6 @@ every other unit stands in the name (`_m`, `_mps`, `_rad`, ...). A vehicle is a 
 `Vehicle`. Names are loaded when they are first used, so that importing the package is quick.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

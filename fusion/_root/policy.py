@@ -4,8 +4,6 @@ policy = terrafusion.policy.load()                       # the shipped one, or a
 policy = terrafusion.policy.fit("policy.yaml", seeds=3)  # from drives of the twin and labelled logs
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

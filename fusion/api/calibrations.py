@@ -1,7 +1,5 @@
 """`terrafusion.calibrate_sensors`: a robot's sensor numbers from its logs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`terrafusion.diagnose`: where robot and twin differ, and which effect causes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 python -m terrafusion.fusion.api.file_schemas docs/schemas
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

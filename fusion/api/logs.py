@@ -1,7 +1,5 @@
 """Logs as the public functions take them: opened, or a path to open."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

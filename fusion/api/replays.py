@@ -1,7 +1,5 @@
 """`terrafusion.replay`: a recorded drive through the estimator, with its scores and its report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

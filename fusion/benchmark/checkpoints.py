@@ -3,8 +3,6 @@
 parts/<key>.json     result of one part, with the hash of the sources and the state of the files it depends on
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

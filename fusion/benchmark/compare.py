@@ -8,8 +8,6 @@ interval of a share of two gains is the percentile bootstrap's over units, both 
 A failed replay has an infinite error. Runs on which the base failed are left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the references: once as it is, and once with the named effect. Any function that
 estimator's place.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Field logs as runs of the benchmark: which files are present, their outages, reference and true ground."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """Measured runs on one clock: wheel speeds, commands, gyro and true body velocity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

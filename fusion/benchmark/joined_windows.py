@@ -6,8 +6,6 @@ and sideways speeds that best explain the poses of every window (`body_velocity`
 the gyro.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The weighting methods that a benchmark compares: one estimator, different noise and ground labels."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The plan depends on the recording alone, so all modes lose the same fixes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

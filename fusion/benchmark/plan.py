@@ -1,7 +1,5 @@
 """What a benchmark runs: families, plants, seeds and field logs, cut into jobs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

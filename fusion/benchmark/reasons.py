@@ -4,8 +4,6 @@ The detector is to blame if the true labels would have won, else the policy. The
 are those with the largest excess of mean square velocity error over the winning method, weighted by time.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The project's targets that a benchmark can decide, and their verdicts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence

@@ -6,8 +6,6 @@ policy, the terrain model and the tuning use seeds far below `FIRST_SEED`; those
 development.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`terrafusion allan`: Allan deviation of a simulated or recorded IMU."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`terrafusion benchmark`: adaptive weighting against fixed and other baselines, in pairs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What all commands share: options, the place of results, what is printed, and how they end."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """`terrafusion completion bash|zsh|fish`: the script by which a shell completes commands and options."""
 
-from __future__ import annotations
-
 import os
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`terrafusion gap-blind`: the diagnosis judged on sealed trials of a plant that is not the twin."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from pathlib import Path

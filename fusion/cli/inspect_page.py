@@ -4,8 +4,6 @@ It is made of the data that `--json` prints. A line is a text with the style of 
 show on a terminal only.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any

@@ -5,8 +5,6 @@ A command is a function whose docstring is its help and, in `Args`, describes it
 `terrafusion --help` is fast.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import sys

@@ -1,7 +1,5 @@
 """Where a command writes: the default place, and what it may replace."""
 
-from __future__ import annotations
-
 import re
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`terrafusion policy fit`: the weighting policy from simulated runs and labelled logs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`terrafusion self-check`: whether this installation works, and what to do where it does not."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """`terrafusion study`: the source study, reproduced by the twin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Wrong usage of the command line, as one line with the nearest match."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 from typing import Any

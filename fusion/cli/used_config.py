@@ -3,8 +3,6 @@
 It holds neither a time nor where the results went.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The numbers a run used that neither log nor vehicle file gives, and how far they may be off."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass

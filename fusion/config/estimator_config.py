@@ -1,7 +1,5 @@
 """Settings of the estimator; every one has a default that suits a ground robot."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import TypedDict

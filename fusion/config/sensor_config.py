@@ -5,8 +5,6 @@ planar graph, `graph/planar.py`): yaw from the gyro's z axis, else from the diff
 from GNSS alone. Notes tell which.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

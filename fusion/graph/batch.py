@@ -6,8 +6,6 @@ equations of a chain with the noise of a data sheet cannot be factored in double
 1e9 times tighter than what ties it to the world).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import gtsam

@@ -5,8 +5,6 @@ right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim 
 linear states' steps, the wheels (4), then whatever else a keyframe has.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import defaultdict
 from collections.abc import Sequence

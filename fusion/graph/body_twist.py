@@ -1,7 +1,5 @@
 """Covariance of the body twist, from that of a keyframe."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

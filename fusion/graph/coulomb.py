@@ -10,8 +10,6 @@ moves as they roll. In a turn the wheels of a skid-steered robot slip already, a
 sliding outwards.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

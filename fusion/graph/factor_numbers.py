@@ -5,8 +5,6 @@ untrusted file would let the file determine what is built and how large. Here a 
 alone; the structure is that of a factor of the same kind which this process has made and written itself.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Factors of the localisation graph, each made from one measurement."""
 
-from __future__ import annotations
-
 import functools
 import math
 

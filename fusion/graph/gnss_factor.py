@@ -11,8 +11,6 @@ has a small `share` of the drift. `antenna` corrects the lever arm of the vehicl
 lateness of the receiver's stamps while the antenna moves with v; both are states.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -3,8 +3,6 @@
 The last column of rows is the right-hand side; rows over two keyframes have the older one's columns first.
 """
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X

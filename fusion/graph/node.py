@@ -1,7 +1,5 @@
 """One keyframe of the chain, with all that touches it."""
 
-from __future__ import annotations
-
 import operator
 from dataclasses import dataclass, field
 

@@ -8,8 +8,6 @@ attitude factor. They and the accelerometer's bias are not estimated. Height fol
 start.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import gtsam

@@ -1,7 +1,5 @@
 """IMU preintegration between keyframes, with noise scaled by the weighting policy."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

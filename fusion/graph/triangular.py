@@ -1,7 +1,5 @@
 """Square roots of information matrices: QR of stacked rows, and solving with the triangle."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

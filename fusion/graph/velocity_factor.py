@@ -9,8 +9,6 @@ body. Without a calibration the velocity of the body origin is a prior instead (
 with one, such priors would hold the velocity to the lever arm assumed when they came.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

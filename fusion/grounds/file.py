@@ -1,7 +1,5 @@
 """Ground memory as a file, `terrafusion.grounds/1`: a robot's grounds, without any position."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

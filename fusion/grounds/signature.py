@@ -4,8 +4,6 @@ Vibration bands are normalised by speed (`terrain.features`) and by the robot's 
 accelerometer are compared with the wheels. A number that the sensors do not give is NaN.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

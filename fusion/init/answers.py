@@ -1,7 +1,5 @@
 """What the user says of a robot that no log tells, and what is assumed where nothing is said."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

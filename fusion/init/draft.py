@@ -1,7 +1,5 @@
 """A vehicle file of the short form in the making: a line a number, with unit and source as its comment."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from dataclasses import dataclass

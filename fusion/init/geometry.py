@@ -1,7 +1,5 @@
 """Lines of a vehicle file for a robot's geometry: given by the user, by the log, measured, or assumed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

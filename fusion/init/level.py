@@ -1,7 +1,5 @@
 """How far the IMU of a robot is tilted against its body, from one drive."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@
 Each step opens or replays the log with the file as it is by then, so that what is written is what was used.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ for motion they look like slip: of two sensors of a change of speed the one that
 scaled down (errors in variables; Fuller 1987, Measurement Error Models, ch. 1).
 """
 
-from __future__ import annotations
-
 MEMORY = 30
 """Samples over which the noise is averaged, and that are seen before a decision."""
 LEAST_M, MOST_M = 0.005, 0.2

@@ -5,8 +5,6 @@ goes on with the next. Numbers that no ground robot has are left out and counted
 no run.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Whether a yaw gyro reports degrees per second: it then turns 57 times as far as the wheels say."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from terrafusion.datasets.core.errors import DataError

@@ -1,7 +1,5 @@
 """Curvature of the path by the steering angles."""
 
-from __future__ import annotations
-
 import bisect
 import math
 

@@ -1,7 +1,5 @@
 """Buffers of sensor samples: checked, ordered by time, cut at keyframes."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

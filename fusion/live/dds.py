@@ -4,8 +4,6 @@ A topic `/imu/data` of ROS 2 is the DDS topic `rt/imu/data`, and the type `senso
 `sensor_msgs::msg::dds_::Imu_`. Needs the `cyclonedds` package (extra `live`).
 """
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable, Iterator

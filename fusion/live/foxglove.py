@@ -1,7 +1,5 @@
 """A live view in Foxglove: what the node publishes, over its WebSocket (extra `foxglove`)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError

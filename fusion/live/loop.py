@@ -1,7 +1,5 @@
 """The live loop: messages go to the estimator as they arrive, odometry comes out at the rate of the IMU."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator

@@ -7,8 +7,6 @@
     node.tick(now_s)
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -4,8 +4,6 @@ A sample waits until the IMU (or, without one, the wheels) is ahead of it by a l
 than that are passed on at once: the estimator copes with them, but its result is then not that of a replay.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 from typing import Any

@@ -3,8 +3,6 @@
 Frames are those of REP-105: `map` -> `odom` takes the jumps of fixes, `odom` -> `base_link` is continuous.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Which sensors a running robot has: found in what it sends for a second, as in a short bag."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections import Counter, deque

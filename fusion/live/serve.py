@@ -1,7 +1,5 @@
 """A `LiveNode` on DDS until it is stopped."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

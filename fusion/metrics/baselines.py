@@ -8,8 +8,6 @@ alone is the last fixes, interpolated while they come and held in gaps.
 Both are scored like the estimate: at the same times, against the same reference.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Scores of a classifier's probabilities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ with d N_eff degrees of freedom. rho is estimated about zero, the known mean (a 
 sample), and truncated at its first value that is not positive (Geyer 1992, initial positive sequence).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The reference is the truth of a recording or held-out GNSS fixes. `scores` condenses the series.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Plausibility of an estimate without a reference: finite numbers, speed and path against the wheels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

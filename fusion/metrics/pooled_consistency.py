@@ -4,8 +4,6 @@ The band is where the mean of a consistent estimator falls, given the effective 
 The interval is the percentile bootstrap's over runs (Efron 1979, Ann. Statist. 7(1)).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

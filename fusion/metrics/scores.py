@@ -14,8 +14,6 @@
 Times in seconds count from the start of the recording.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

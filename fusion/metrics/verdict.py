@@ -4,8 +4,6 @@ Tests of what the run itself shows, most of them chi-square tests of its errors 
 own covariance. The limits are constants below; docs/reference/verdict.md lists the rules.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass

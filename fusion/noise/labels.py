@@ -1,7 +1,5 @@
 """Ground labels for the estimator, in place of its terrain detector."""
 
-from __future__ import annotations
-
 import bisect
 from dataclasses import dataclass
 

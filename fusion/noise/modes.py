@@ -1,7 +1,5 @@
 """Tuning of the estimator modes, as found by `python -m tests.studies.mode_tuning`."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from importlib import resources

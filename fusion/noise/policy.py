@@ -5,8 +5,6 @@ Where the class is uncertain, the noise is the moment match of the mixture: its 
 spread of the class means (law of total variance).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from dataclasses import dataclass

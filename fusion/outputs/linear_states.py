@@ -1,7 +1,5 @@
 """The linear states of an `Estimate`: series by name, and the result of an online calibration."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ Each file appears when it is whole. Numbers that are unknown or not finite are n
 CSV. The same estimate gives the same bytes.
 """
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import math

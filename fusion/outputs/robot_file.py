@@ -1,7 +1,5 @@
 """Writes a vehicle file of the short form with the numbers that `sensor_calibration` found."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from pathlib import Path

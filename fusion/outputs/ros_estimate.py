@@ -4,8 +4,6 @@ Frames follow REP-105: with GNSS the path is in `map`, because a fix may move it
 start and heading are arbitrary and the path drifts without a jump, which is what `odom` means.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The tables of a benchmark as plain cells, for the terminal, the document and the page alike."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The files of a diagnosis: `diagnosis.json`, `judge.json` with the estimator's gap, and `report.html`."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence

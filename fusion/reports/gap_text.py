@@ -2,8 +2,6 @@
 the catalogue is, its laws, and how to check it on the robot.
 """
 
-from __future__ import annotations
-
 import difflib
 import functools
 import math

@@ -1,7 +1,5 @@
 """`report.html` of a log: findings of the log checks, channels and measures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 What was not scored is not mentioned; a comparison words wins and losses alike.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

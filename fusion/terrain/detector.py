@@ -1,7 +1,5 @@
 """`TerrainDetector`: windows in, class probabilities out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

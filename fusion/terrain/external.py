@@ -1,7 +1,5 @@
 """Class probabilities of a log's external source, such as a camera."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -13,8 +13,6 @@ the spectrum over time at f is v/f^2 times a constant, so the RMS in a fixed ban
 factor is divided out, v being the faster of robot and wheels: wheels that spin on the spot shake, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ is drawn from the prior (Rabiner 1989, forward recursion, of a chain continuous 
 without observation, the filter returns to the prior.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

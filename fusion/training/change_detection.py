@@ -1,7 +1,5 @@
 """Delay of detecting changes of ground, on routes spliced from the signals of held-out runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Cross-validation by run over labelled logs: folds, training with calibration, scores on held-out runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """Scores of the terrain detector on routes it was not trained on."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Sequence

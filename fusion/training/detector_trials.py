@@ -1,7 +1,5 @@
 """Tests of the terrain detector for `terrafusion terrain eval`: new runs, missing sensors, unseen grounds."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ Missing features are NaN; the E-step uses their conditional moments given the ob
 Jordan 1994). scikit-learn's GaussianMixture takes no missing values.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ ground, is the moment match of the grounds with standard deviations (but the rec
 times larger.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

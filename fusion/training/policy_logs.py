@@ -10,8 +10,6 @@ s and 0.026 for 10 s. Shorter variation is not seen, so logs give no correlation
 deviation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

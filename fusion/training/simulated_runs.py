@@ -1,7 +1,5 @@
 """Simulated runs for training, and their windows as the estimator forms them."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import hashlib

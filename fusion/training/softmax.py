@@ -9,8 +9,6 @@ seconds before by more than they do along runs on one ground (Hotelling's T^2 pe
 probabilities, log-odds do not saturate: a change shows although the new ground is taken for a wrong class.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

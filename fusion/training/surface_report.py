@@ -1,7 +1,5 @@
 """Evaluation of labelled logs, as `terrafusion terrain eval LOGS` prints it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Three disjoint sets of seeds: for the densities, for the calibration of temperat
 and for the scores.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Windows of finished simulated runs in a folder, so that an interrupted training continues."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path

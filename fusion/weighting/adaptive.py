@@ -1,7 +1,5 @@
 """Sensor noise in force by the detected terrain, with a reason for every change."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import deque
 from collections.abc import Mapping

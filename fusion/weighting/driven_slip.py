@@ -7,8 +7,6 @@ Gelman et al. 2013, Bayesian Data Analysis, sec. 3.3) whose prior is the policy'
 time, by the probability of the class, and less where the slip is measured badly.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array

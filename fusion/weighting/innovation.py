@@ -16,8 +16,6 @@ Units: wheels (m/s)^2, GNSS the variance over the reported one. The wheels' sigm
 noise that is rejected could otherwise never be learnt.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

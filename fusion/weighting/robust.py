@@ -17,8 +17,6 @@ No loss helps an estimate that went astray, so the gate's re-acquisition stays i
 that contradict the estimate and agree with each other are believed.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

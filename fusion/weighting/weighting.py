@@ -1,7 +1,5 @@
 """What a mode makes of single measurements: the interface between the estimator and its baselines."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Protocol

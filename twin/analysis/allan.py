@@ -1,7 +1,5 @@
 """Overlapping Allan deviation of an IMU and its noise parameters (IEEE Std 952-1997, annex C)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ IMU is integrated after a rest of about 2 s and a 0.5 s moving average. Cut-off,
 threshold and kind of smoothing are not stated: those here are assumed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a run amounts to: slip, energy and where it went, and whether the robot got stuck."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The answer of a calibration, from where the search ended: parameters with sigma, fits, notes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`calibrate`: fit parameters of a vehicle and its grounds to logs, by making the twin drive as they did."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence

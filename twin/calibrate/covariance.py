@@ -6,8 +6,6 @@ noise is neither as steady nor as independent between channels as the model of `
 weights (Newey and West 1987): H^-1 (M + prior) H^-1 (Huber 1967; White 1980).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array

@@ -1,7 +1,5 @@
 """Vehicle and soil files with the calibrated numbers in place, each with where it comes from."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from pathlib import Path

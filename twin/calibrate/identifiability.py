@@ -4,8 +4,6 @@ Parameters are scaled by their prior sigmas, so that the posterior sigma along a
 holds no information on it. Sensor errors and poses are marginalised beforehand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Input of the twin for a log: its commands within the robot's limits, or its measured wheel speeds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 The start pose of a window is a guess from dead reckoning aligned to the positions of the log.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

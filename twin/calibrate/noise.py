@@ -7,8 +7,6 @@ criterion, Hurvich and Tsai 1989) or, where a data sheet gives the time constant
 Gauss-Markov noise; rows are whitened by its Cholesky factor before they are squared.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Iterated generalised least squares: the scale of each channel first, then its correlation in time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

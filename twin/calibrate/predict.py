@@ -5,8 +5,6 @@ the wheels) and their derivatives continue from one window into the next, while 
 starts from a guess that the fit corrects. So no error of the pose accumulates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The result of a calibration: parameters with sigma, identifiability, and the fit of each channel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

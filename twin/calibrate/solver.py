@@ -8,8 +8,6 @@ scipy.optimize.least_squares (trf, one call a pass) gives the same numbers withi
 the runs of the twin, which are all the time: it evaluates anew where only the noise has changed.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The model a calibration starts from: vehicle, soils and parameters of all logs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Suggests manoeuvres that would identify the unresolved parameters, by their information in the twin."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

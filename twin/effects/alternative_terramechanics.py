@@ -17,8 +17,6 @@ Shear stress over the displacement j: tau = tau_max j / (K + j) (Kondner 1963), 
 tau_max (1 - exp(-j / K)) (Janosi and Hanamoto 1961): as stiff at first, as strong in the end, softer between.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """All forms of all effects by name; forms of the user's own join by `register`."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import math

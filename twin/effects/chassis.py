@@ -1,7 +1,5 @@
 """What a chassis does beyond a rigid box on four free wheels: terms of a vehicle, no causes of a gap."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Effects of the environment: the tilt of the ground and the air."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -5,8 +5,6 @@ name and gives new values of quantities of that stage. With a parameter of zero 
 it was given; a graph made without the parameter does not contain the term.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Effects of the sensors. Positive offsets in time mean a reading that shows the past."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ tangents f and r of the angles the path of the body origin has the curvature k =
 sideways at the share s = (f + r) / 2, so the ground passes a wheel at (x, y) along (1 - k y, s + k x).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Effects of the ground."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Effects of the vehicle: masses, geometry, drive train and command path."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """The C source of the twin's drivers: types, kernels, the model's graph and the loop around it."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from importlib import metadata, resources
 from typing import Any, NamedTuple

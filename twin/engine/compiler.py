@@ -3,8 +3,6 @@
 Entries of the cache (`library_cache`) are named by a hash of source, flags, compiler and processor.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib

@@ -8,8 +8,6 @@ Types in the C code: `tf_real` a number (or a vector of runs), `tf_four` one num
 a vector of directions.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Every node is an operation on earlier nodes, so the numbers of the nodes are a t
 that are the same for the four wheels are found, so that one vector instruction does them.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Sequence

@@ -4,8 +4,6 @@ Both backends run the same graph with the same step, inputs linear between
 samples and the soil following the route; they agree to rounding.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A library runs with the rights of whoever loads it, so none is taken from a fold
 have written. Beside each stands its SHA-256; one that is damaged is compiled again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -6,8 +6,6 @@ is cheap. Eliminating a vertex joins its predecessors to its successors (Griewan
 Derivatives, ch. 9, vertex elimination with the lowest Markowitz degree).
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Collection
 

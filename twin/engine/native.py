@@ -1,7 +1,5 @@
 """The compiled drivers as Python calls them."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import threading

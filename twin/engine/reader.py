@@ -1,7 +1,5 @@
 """The sensors' readings along a run, compiled: several samples side by side in the lanes of vectors."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 

@@ -1,7 +1,5 @@
 """The twin in CasADi's virtual machine: where no C compiler is found, and to test the C code against."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

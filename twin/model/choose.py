@@ -1,7 +1,5 @@
 """The vehicle of a recording: the one asked for or named by the log, with the log's own geometry."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -9,8 +9,6 @@ The graph is built in stages; at each of them optional effects may change the
 quantities of that stage (see `effects.form.STAGES`).
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ practice: Vanmarcke 1977). It is drawn on a periodic grid by filtering white noi
 domain, so it has no border and costs one FFT. Patches are where a second such field is high.
 """
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The parameter files that come with the library, found by name."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from importlib import resources

@@ -6,8 +6,6 @@ effects are exact. A sensor model that reports means over an interval differs fr
 changes within the interval.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ The world is ENU; the robot moves in a plane through the origin whose steepest
 ascent points along `aspect_rad` (0 east, left positive).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

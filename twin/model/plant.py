@@ -1,7 +1,5 @@
 """What is integrated: vehicle parameters, the ground under the wheels, the optional effects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

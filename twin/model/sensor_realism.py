@@ -4,8 +4,6 @@ Every entry of the sections defaults to "absent", so that a vehicle file may
 leave out what nobody knows.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Annotated

@@ -6,8 +6,6 @@ the source study (Tab. 3). The `mud` section stands for mud that clings to the
 wheels, `vibration` for what an IMU on the chassis feels.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ moistures, its name ends in the percentage. What no table gives (vibration, roll
 pressure) stands in `params/published_soil.yaml`.
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 import math

@@ -1,7 +1,5 @@
 """A vehicle, a soil and the sensors' places as vectors in the order of `physics.layout`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

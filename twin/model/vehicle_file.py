@@ -1,7 +1,5 @@
 """Vehicle files in their two forms: complete, or only what differs from another one (`robot`)."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any

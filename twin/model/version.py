@@ -1,7 +1,5 @@
 """Which version of the library and of the twin's model makes a run."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 from importlib import metadata, resources

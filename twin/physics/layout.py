@@ -3,8 +3,6 @@
 Nothing else knows a position in these vectors: look entries up by name.
 """
 
-from __future__ import annotations
-
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheels in every array."""
 ENDS, SIDES = (1, 1, -1, -1), (1, -1, 1, -1)

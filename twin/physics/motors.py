@@ -6,8 +6,6 @@ given next. So there is no algebraic loop. `motor_current` and `motor_voltage`
 work on CasADi expressions and numpy arrays alike.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 SMOOTHING_S = 0.02

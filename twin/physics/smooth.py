@@ -1,7 +1,5 @@
 """Smooth stand-ins for |x|, max and min: CasADi expressions with derivatives of every order everywhere."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -5,8 +5,6 @@ number that may be zero. Symbols: W load, R radius, D = 2R, b width, z sinkage, 
 n exponent of the pressure-sinkage law p = (k_c / b + k_phi) z^n.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ smooth everywhere, and is zero where the physics is: no force without
 shear displacement, no resistance without motion.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import casadi as ca

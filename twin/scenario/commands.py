@@ -1,7 +1,5 @@
 """From a scenario to driven states: command limits, side speeds, dead time, steering by waypoints."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

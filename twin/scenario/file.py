@@ -1,7 +1,5 @@
 """Reading a scenario file: strict keys and ranges; errors name the key, the value and what is allowed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

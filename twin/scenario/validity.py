@@ -5,8 +5,6 @@ depends on the run is checked here: ground pressure, wheel diameter and moisture
 it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Current and voltage sensors of the motor controllers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, TimesNs

@@ -4,8 +4,6 @@ Effects on the motion are part of the plant. What effects add to the readings (`
 added to the channels, whose noise stays the same. A delay of a whole sensor shifts its stamps.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Wheel encoders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, TimesNs

@@ -7,8 +7,6 @@ Field: M (R^T b + disturbance of the place) + hard iron + white noise, in body a
 the datum of simulated drives. M = I + E (soft iron), E symmetric, and the hard iron are drawn once a run.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inertial measurement unit."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

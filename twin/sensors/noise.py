@@ -1,7 +1,5 @@
 """Random series of the sensor models, and the streams they are drawn from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Steering angle sensors, of vehicles that steer."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 The twin's effective friction is the cap of its shear force (`SoilParams.shear.friction_cap`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

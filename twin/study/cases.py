@@ -1,7 +1,5 @@
 """The study's three runs, driven by the twin: seeds in parallel, the same arrays for each."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

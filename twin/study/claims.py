@@ -1,7 +1,5 @@
 """Claims of the study held against the twin: what it says, what decides, and the table of agreement."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources

@@ -7,8 +7,6 @@ them under trees. What the figures share with the study is their kind, not
 their course.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

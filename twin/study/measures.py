@@ -1,7 +1,5 @@
 """What the study's Figs. 4 to 9 show, as numbers of a run."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@
 four-wheel robot in Gazebo Classic on mud and sand, and one drive on real sand.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Everything the claims are held against: one spread over the seeds for each measured quantity."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """A mean over runs with its interval, and the spread of single runs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ study = run_study(StudyPlan(seeds=10, jobs=2))
 study.rows          # the table of agreement
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

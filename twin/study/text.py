@@ -1,7 +1,5 @@
 """The reproduced study as lines of text and as Markdown."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ The runs are the cross product of the axes, the last axis of `AXES` running
 fastest; a random sweep is a Latin hypercube of so many runs instead.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import hashlib

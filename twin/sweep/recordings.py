@@ -1,7 +1,5 @@
 """Chosen runs of a sweep once more, with all sensors, as logs."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -8,8 +8,6 @@ The rows and their order depend on the sweep alone, not on the number of
 workers, the backend or interruptions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

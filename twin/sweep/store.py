@@ -7,8 +7,6 @@
 A killed process loses only the chunks it was computing.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Both ways go through the decoder and the `ChannelBuilder` of bags: a message giv
 from a bag.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What ROS 1 and ROS 2 bags share: choose topics, read them, build the recording."""
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

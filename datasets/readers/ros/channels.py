@@ -1,7 +1,5 @@
 """Streams of a bag -> channels of a recording, with a note for everything assumed or left out."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path

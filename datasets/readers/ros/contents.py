@@ -1,7 +1,5 @@
 """Topics of a bag whose robot is not known yet, and between which of them only the user can choose."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

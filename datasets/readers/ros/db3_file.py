@@ -1,7 +1,5 @@
 """The container of ROS 2 bags in SQLite."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

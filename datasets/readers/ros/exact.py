@@ -6,8 +6,6 @@
 cannot hold it to the bit: its stamp (seconds, nanoseconds), then the columns of the log folder.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence

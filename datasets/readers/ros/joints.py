@@ -1,7 +1,5 @@
 """Wheels and steering axes among the joints of a JointState: which joint is which, and its values."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any

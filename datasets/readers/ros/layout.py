@@ -5,8 +5,6 @@ Such a `MessageLayout` is derived once, from one message and its definition; all
 then read by one structured dtype, bit for bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

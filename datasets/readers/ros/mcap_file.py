@@ -4,8 +4,6 @@ Schemas, channels and chunks are parsed by the `mcap` library; message records, 
 one at a time, are found by one walk over their lengths. An index is used to skip chunks, where there is one.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ A container (`ros1`, `mcap_file`, `db3_file`) lists its `BagSource`s and yields 
 of a chunk and the places of one source's messages in it. No message becomes a Python object.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass

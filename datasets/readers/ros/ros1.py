@@ -5,8 +5,6 @@ themselves sequences of records, which are found by one walk over their lengths:
 every message, which takes 7 times as long.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

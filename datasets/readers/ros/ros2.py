@@ -1,7 +1,5 @@
 """ROS 2 bags: a folder with `metadata.yaml` and the files that it names, or one `.mcap` or `.db3` file."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from contextlib import ExitStack

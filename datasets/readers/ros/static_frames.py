@@ -1,7 +1,5 @@
 """Fixed transforms of a robot (`/tf_static`): where its sensors are, and how they are turned."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array

@@ -1,7 +1,5 @@
 """Topics of a bag as streams: the messages of a container, decoded in one pass over the file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar

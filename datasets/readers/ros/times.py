@@ -1,7 +1,5 @@
 """Times of a bag's messages: header stamps or receipt stamps, and the repair of clock steps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field

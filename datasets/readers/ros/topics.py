@@ -1,7 +1,5 @@
 """Which topic of a bag becomes which channel: by type, by name, or on request."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import re

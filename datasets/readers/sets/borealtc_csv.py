@@ -4,8 +4,6 @@
 of one number are one run, the folder names its ground, and both begin at 0: no absolute time.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

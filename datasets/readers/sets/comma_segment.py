@@ -7,8 +7,6 @@ positive to the left), `IMU/gyro` and `IMU/accelerometer` (forward, right, down)
 camera's pose: ECEF positions, orientations as quaternions w, x, y, z. Any file of a segment opens all of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ and inflating ends at `limits.MATLAB_BYTES`. scipy.io is not safe here: it recur
 without a limit, so that a file of 1 MB crashes the interpreter.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

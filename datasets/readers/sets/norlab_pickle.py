@@ -5,8 +5,6 @@ window file (`slip_dataset_all.pkl`) has one row a window, 40 columns a signal. 
 where its SHA-256 is in a catalogue, and even then by `safe_pickle` only.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Times, fix class and sigmas of the fixes come in several ways.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -6,8 +6,6 @@ arrays of 3) reads alike, whatever pandas is installed. All check their argument
 bytes, kinds of numbers against a short list.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -5,8 +5,6 @@ A pickle is a program: it names functions and calls them. Here it gets the stand
 needs are obeyed; and what it calls must be one of the stand-ins.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import struct

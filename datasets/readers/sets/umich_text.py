@@ -5,8 +5,6 @@ Columns, between blanks and without a header: `*_imu.txt` t wx wy wz ax ay az; `
 seconds. Any file of a recording opens all of it: the others are found beside it by their names.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

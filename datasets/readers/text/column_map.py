@@ -1,7 +1,5 @@
 """The column map of a plain table: a YAML file that says what its columns are (docs/reference/formats.md)."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import json

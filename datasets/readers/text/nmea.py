@@ -1,7 +1,5 @@
 """NMEA 0183 logs: GGA, RMC, GST, VTG and ZDA of any talker, also between other lines and bytes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """Sentences of an NMEA log, checked and grouped by epoch."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Columns of a Parquet file, by pyarrow, which is an optional dependency."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

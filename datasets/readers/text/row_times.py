@@ -1,7 +1,5 @@
 """Times of the rows of a file: in order, or repaired on request, else refused."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass, field

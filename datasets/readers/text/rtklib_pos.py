@@ -4,8 +4,6 @@ Positions come as latitude/longitude/height (degrees, or degrees, minutes and se
 as a baseline east/north/up of the base station; times as calendar or as GPS week and seconds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plain tables, text or Parquet, with a column map."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Columns of a plain text table, and where its header is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """TUM trajectories: lines of `t x y z qx qy qz qw`, comments behind #."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

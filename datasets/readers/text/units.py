@@ -1,7 +1,5 @@
 """Units that a column of a table may be in, by the unit that ends the name of its field."""
 
-from __future__ import annotations
-
 import math
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2

@@ -1,7 +1,5 @@
 """The clock of an MT Manager export: UTC, the device's ticks, or packets at the update rate."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Angular rate and specific force of an MT Manager export, and the unit the rates are in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

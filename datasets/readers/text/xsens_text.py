@@ -5,8 +5,6 @@ ticks of 10 kHz that wrap at 32 bits). The position is the device's own, fused w
 attitude is left out: the output of a filter is not ground truth.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ellipses of position uncertainty along a path, and the fixes that were rejected."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

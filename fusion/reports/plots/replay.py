@@ -1,7 +1,5 @@
 """Figures over time of the replays of one drive: errors, ground and slip, weights, sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

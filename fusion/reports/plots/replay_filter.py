@@ -1,7 +1,5 @@
 """Figures of the filter's own consistency: biases, normalised innovations and their mean in windows."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Map of the replays of one drive, over truth and fixes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
