@@ -74,18 +74,6 @@ def body_velocity(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: A
     return np.stack([np.interp(t_s, knots, speed) for speed in speeds], axis=1)
 
 
-def speed_noise(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: Array) -> Array:
-    """(N,) half the difference of the speeds from even and from odd poses, m/s: the noise of those from all.
-
-    Only errors that are independent between poses (scatter, time stamps), not a common scale or lag.
-    """
-    even = np.arange(len(poses.t_s)) % 2 == 0
-    one, two = (
-        body_velocity(t_s, yaw_rate_radps, poses.select(half), rolled_mps)[:, 0] for half in (even, ~even)
-    )
-    return 0.5 * (one - two)
-
-
 def _turned(t_s: Array, psi: Array, poses: Poses, rolled_mps: Array) -> Array:
     """Positions (M, 2) rotated into the frame of the gyro's heading `psi` (N,)."""
     at = np.interp(poses.t_s, t_s, psi)

@@ -8,19 +8,53 @@ the gyro.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.fusion.benchmark.body_velocity import heading
-from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, chain_starts, chains_of, field_run
+from terrafusion.fusion.benchmark.body_velocity import CHUNK_S, Poses, body_velocity, heading
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
+DT_S = 0.05
+JOIN_RADPS, JOIN_WHEEL_RADPS = 0.25, 1.5
+"""Largest steps of gyro and wheel speed between consecutive windows."""
+HELD_S = 0.2
+"""A wheel speed constant for longer counts as measured again."""
+POSE_GAP_S = 0.6
+"""The true velocity is unknown in longer gaps between poses."""
+MIN_POSES = 20
+FIX_SIGMA_M = 0.1
+"""Fixes with a larger sigma do not determine the speed over 5 s (docs/evidence/field.md)."""
 MAX_TRUTH_GAP_S = 1.0
 """A joined run with a longer gap in its truth gets no truth."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainMotion:
+    """Motion of a chain of recordings, sampled at `DT_S`.
+
+    Attributes:
+        vehicle: nominal parameters.
+        t_s: (N,) from 0.
+        sides_radps: (N, 2) measured speed of left and right wheels.
+        yaw_rate_radps: (N,) of the gyro.
+        velocity_mps: (N, 2) true forward and sideways speed, NaN where no pose is near.
+        poses: from which it was found.
+    """
+
+    vehicle: VehicleParams
+    t_s: Array
+    sides_radps: Array
+    yaw_rate_radps: Array
+    velocity_mps: Array
+    poses: Poses
 
 
 def joined_runs(name: str, recordings: Sequence[Recording]) -> list[Recording]:
@@ -33,12 +67,12 @@ def joined_runs(name: str, recordings: Sequence[Recording]) -> list[Recording]:
         DataError: the windows have no wheels or no gyro, or do not say which vehicle it is.
     """
     chains = [chain for chain in chains_of(recordings) if len(chain) > 1]
-    return [_joined(f"{name}#{k}", name, chain) for k, chain in enumerate(chains)]
+    return [_joined_run(f"{name}#{k}", name, chain) for k, chain in enumerate(chains)]
 
 
-def _joined(name: str, recording: str, chain: Sequence[Recording]) -> Recording:
+def _joined_run(name: str, recording: str, chain: Sequence[Recording]) -> Recording:
     starts, _ = chain_starts(chain)
-    run = field_run(name, recording, chain)
+    run = motion_of_chain(recording, chain)
     first = chain[0]
     imu = _channel(chain, starts, lambda r: r.imu, ("gyro_radps", "accel_mps2"))
     # The first wheel speed of a window repeats an old one, as does its first pose.
@@ -89,7 +123,7 @@ def _channel(
     return {key: np.concatenate(found) for key, found in parts.items()}
 
 
-def _path(run: FieldRun) -> Trajectory | None:
+def _path(run: ChainMotion) -> Trajectory | None:
     """The run's path by its speeds and the gyro's heading, from the first to the last known speed."""
     known = np.flatnonzero(np.isfinite(run.velocity_mps).all(axis=1))
     if len(known) < 2 or float(np.diff(run.t_s[known]).max()) > MAX_TRUTH_GAP_S:
@@ -107,3 +141,154 @@ def _path(run: FieldRun) -> Trajectory | None:
     position[1:, :2] = np.cumsum(steps, axis=0)
     quaternion = np.stack([0 * psi, 0 * psi, np.sin(0.5 * psi), np.cos(0.5 * psi)], axis=1)
     return Trajectory(np.rint(t * 1e9).astype(np.int64), position, quaternion)
+
+
+def chains_of(recordings: Sequence[Recording]) -> list[list[Recording]]:
+    """Chains of consecutive recordings, in their order."""
+    chains: list[list[Recording]] = []
+    for recording in recordings:
+        if chains and _continues(chains[-1][-1], recording):
+            chains[-1].append(recording)
+        else:
+            chains.append([recording])
+    return chains
+
+
+def _continues(before: Recording, after: Recording) -> bool:
+    if not (before.imu and after.imu and before.wheels and after.wheels):
+        return False
+    turn = abs(float(after.imu.gyro_radps[0, 2] - before.imu.gyro_radps[-1, 2]))
+    spin = float(np.abs(after.wheels.speed[0] - before.wheels.speed[-1]).max())
+    return turn < JOIN_RADPS and spin < JOIN_WHEEL_RADPS
+
+
+def motion_of_chain(recording: str, chain: Sequence[Recording]) -> ChainMotion:
+    """Motion of the recordings of a chain, all of the log `recording`.
+
+    Raises:
+        DataError: the log has no wheels or no gyro, or does not say which vehicle it is.
+    """
+    first = chain[0]
+    if first.imu is None or first.wheels is None or first.vehicle is None:
+        raise DataError(
+            "has no gyro, no wheels or no vehicle", file=recording, remedy="compare logs that have all three"
+        )
+    vehicle = load_vehicle(first.vehicle)
+    starts, end = chain_starts(chain)
+    t = np.arange(0.0, end, DT_S)
+    gyro = joined(chain, starts, lambda r: (r.imu.t_ns, r.imu.gyro_radps[:, 2]) if r.imu else None)
+    rate, sides = _means(t, *gyro), _sides(t, chain, starts, vehicle)
+    velocity, poses = np.full((len(t), 2), np.nan), _poses(chain, starts)
+    if len(poses.t_s) >= MIN_POSES:
+        rolled = sides.mean(axis=1) * vehicle.wheel.radius_m
+        velocity = np.where(_near(t, poses.t_s)[:, None], body_velocity(t, rate, poses, rolled), np.nan)
+    return ChainMotion(vehicle, t, sides, rate, velocity, poses)
+
+
+def chain_starts(chain: Sequence[Recording]) -> tuple[list[float], float]:
+    """Start of each recording of a chain, s from the first, and end of the last one."""
+    starts, at = [], 0.0
+    for recording in chain:
+        starts.append(at)
+        imu = recording.imu
+        assert imu is not None
+        step = float(np.median(np.diff(imu.t_ns))) * 1e-9
+        at += float(imu.t_ns[-1] - imu.t_ns[0]) * 1e-9 + step
+    return starts, at
+
+
+def joined(chain: Sequence[Recording], starts: Sequence[float], part) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    """Times (M,) and values (M, ...) of a channel over a chain; times count from the first IMU sample."""
+    times, values = [np.zeros(0)], []
+    for recording, start in zip(chain, starts, strict=True):
+        found = part(recording)
+        if found is None:
+            continue
+        assert recording.imu is not None
+        times.append(start + (found[0] - recording.imu.t_ns[0]) * 1e-9)
+        values.append(found[1])
+    return np.concatenate(times), np.concatenate(values) if values else np.zeros(0)
+
+
+def _means(t: Array, at: Array, values: Array) -> Array:
+    """(N,) means over `DT_S` about each time if the samples are denser, else interpolated."""
+    known = np.isfinite(values)
+    at, values = at[known], values[known]
+    if float(np.median(np.diff(at))) > 0.5 * DT_S:
+        return np.interp(t, at, values)
+    steps = np.diff(at) * 0.5 * (values[1:] + values[:-1])
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    low, high = np.clip(t - 0.5 * DT_S, at[0], at[-1]), np.clip(t + 0.5 * DT_S, at[0], at[-1])
+    return (np.interp(high, at, total) - np.interp(low, at, total)) / np.maximum(high - low, 1e-9)
+
+
+def _sides(t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicle: VehicleParams) -> Array:
+    """(N, 2) wheel speeds, linear between the updates of each side."""
+    radius = vehicle.odometry.wheel_radius_m
+
+    def part(r: Recording) -> tuple[NDArray[np.int64], Array] | None:
+        if r.wheels is None:
+            return None
+        own = r.overrides.wheel_radius_m or radius
+        return r.wheels.t_ns, r.wheels.side_speeds_mps(own) / own
+
+    at, sides = joined(chain, starts, part)
+    out = np.empty((len(t), 2))
+    for side in range(2):
+        keep, last = [0], 0
+        for i in range(1, len(at)):
+            if sides[i, side] != sides[last, side] or at[i] - at[last] > HELD_S:
+                keep.append(i)
+                last = i
+        out[:, side] = np.interp(t, at[keep], sides[keep, side])
+    return out
+
+
+def _poses(chain: Sequence[Recording], starts: Sequence[float]) -> Poses:
+    """Truth or good fixes; every window, and every `CHUNK_S` of a long run, is a chunk with an origin."""
+    times, places, yaws, chunks = (
+        [np.zeros(0)],
+        [np.zeros((0, 2))],
+        [np.zeros(0)],
+        [np.zeros(0, dtype=np.int64)],
+    )
+    for k, (recording, start) in enumerate(zip(chain, starts, strict=True)):
+        assert recording.imu is not None
+        found = _positions(recording)
+        if found is None:
+            continue
+        t_ns, xy, yaw = found
+        t = (t_ns - recording.imu.t_ns[0]) * 1e-9
+        if len(chain) > 1:  # the first pose of a window repeats an old one
+            t, xy, yaw = t[1:], xy[1:], yaw[1:]
+        times.append(start + t)
+        places.append(xy)
+        yaws.append(yaw)
+        long = np.floor(t / CHUNK_S).astype(np.int64) if len(chain) == 1 else np.zeros(len(t), dtype=np.int64)
+        chunks.append(k * 100_000 + long)
+    joined = np.concatenate(times)
+    order = np.argsort(joined, kind="stable")
+    return Poses(
+        joined[order],
+        np.concatenate(places)[order],
+        np.concatenate(yaws)[order],
+        np.concatenate(chunks)[order],
+    )
+
+
+def _positions(recording: Recording) -> tuple[NDArray[np.int64], Array, Array] | None:
+    if recording.truth is not None:
+        yaw = recording.truth.yaw_rad()
+        return recording.truth.t_ns, recording.truth.position_m[:, :2], yaw
+    gnss = recording.gnss
+    if gnss is None or not float(np.median(gnss.sigma_enu_m[:, :2])) <= FIX_SIGMA_M:
+        return None
+    return gnss.t_ns, gnss.enu_m[:, :2], np.full(len(gnss), np.nan)
+
+
+def _near(t: Array, poses: Array) -> NDArray[np.bool_]:
+    """Whether times lie between poses no further apart than `POSE_GAP_S`."""
+    after = np.searchsorted(poses, t)
+    inside = (after > 0) & (after < len(poses))
+    a, b = poses[np.clip(after - 1, 0, len(poses) - 1)], poses[np.clip(after, 0, len(poses) - 1)]
+    return inside & (b - a <= POSE_GAP_S)

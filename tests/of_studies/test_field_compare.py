@@ -14,10 +14,11 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun
+from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.twin_field import compare, summary
+from tests.studies.twin_field.field_run import FieldRun
 from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks, forks_of
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, Hold
 from tests.studies.twin_field.scores import METRICS, interval, medians, scores

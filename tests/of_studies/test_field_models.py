@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.fusion.benchmark.body_velocity import Poses, body_velocity, heading, speed_noise
-from terrafusion.fusion.benchmark.field_runs import DT_S
+from terrafusion.fusion.benchmark.body_velocity import Poses, body_velocity, heading
+from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.twin_field import kinematic
+from tests.studies.twin_field.field_run import speed_noise
 from tests.studies.twin_field.fitting import residuals
 from tests.studies.twin_field.forks import BINS, N_FUTURE, N_PAST, Forks, half_second_means
 from tests.studies.twin_field.twin_model import ACTUATION, GROUND, TwinModel, calibrated, changed

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.benchmark.field_runs import FieldRun
 from terrafusion.twin.model.vehicle import VehicleParams
+from tests.studies.twin_field.field_run import FieldRun
 from tests.studies.twin_field.forks import Forks, forks_of, joined
 from tests.studies.twin_field.models import Model, for_commands, for_wheels
 from tests.studies.twin_field.scores import scores

@@ -13,7 +13,8 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.open import open_recordings
 from terrafusion.fusion.benchmark.field_logs import CUT, WHOLE
-from terrafusion.fusion.benchmark.field_runs import FieldRun, chains_of, field_run
+from terrafusion.fusion.benchmark.joined_windows import chains_of
+from tests.studies.twin_field.field_run import FieldRun, field_run
 
 SETS = ("norlab_drive", "umich_husky", "wvu_pathfinder")
 """Sets with a reference for the motion; of the others of the catalogue only the wheels are known."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.fusion.benchmark.field_runs import DT_S
+from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import SoilParams
