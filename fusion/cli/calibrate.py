@@ -86,17 +86,13 @@ def calibrate(
         suggest: Suggest manoeuvres that would identify the unresolved parameters.
     """
     if sensors:
-        if terrain or parameters or prior or suggest or truth or channels or robust:
-            raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
-        return _sensors(logs, vehicle, how, out)
+        of_the_twin = (terrain, parameters, prior, suggest, truth, channels, robust)
+        return _sensors(logs, vehicle, how, out, any(of_the_twin))
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
-    from terrafusion.twin.model.vehicle import load_vehicle
-    from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
-    if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
-        raise typer.BadParameter(f"{slope_deg:g} is not in 0 to {MAX_SLOPE_DEG:g}", param_hint="--slope-deg")
+    _check_slope(slope_deg)
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
     vehicle = vehicle or "elevate"
@@ -108,27 +104,37 @@ def calibrate(
             slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
         )  # fmt: skip
     write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command_line()})
-    lines = [*summary(found), *(_suggested(found) if suggest else [])]
-    return Result(
-        lines, f"written to {out}", read_json(out / "calibration.json"), vehicle=load_vehicle(vehicle)
-    )
+    return _shown(found, vehicle, out, suggest)
 
 
-def _suggested(found: Calibration) -> list[str]:
-    """The manoeuvres that would identify the rest."""
+def _check_slope(slope_deg: float) -> None:
+    """A slope that no scenario may have is wrong usage (exit status 2)."""
+    from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
+
+    if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
+        raise typer.BadParameter(f"{slope_deg:g} is not in 0 to {MAX_SLOPE_DEG:g}", param_hint="--slope-deg")
+
+
+def _shown(found: Calibration, vehicle: str, out: Path, suggest: bool) -> Result:
+    """What the command prints, on request with the manoeuvres that would identify the rest."""
     from terrafusion.twin.calibrate.suggest import suggest as suggestions
+    from terrafusion.twin.model.vehicle import load_vehicle
 
-    return [suggestion.sentence() for suggestion in suggestions(found)]
+    lines = summary(found) + [one.sentence() for one in (suggestions(found) if suggest else ())]
+    document = read_json(out / "calibration.json")
+    return Result(lines, f"written to {out}", document, vehicle=load_vehicle(vehicle))
 
 
-def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path) -> Result:
-    """Learn the sensor numbers of a robot, and write its file."""
+def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path, of_the_twin: bool) -> Result:
+    """Learn the sensor numbers of a robot, and write its file; options of the twin are wrong usage."""
     import dataclasses
 
     from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors
 
+    if of_the_twin:
+        raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
     recordings = how.open_all(logs, load_rig(vehicle))

@@ -98,25 +98,11 @@ def add_command(
         files: options that are further files to write, each with a word of the files it may replace.
         as_json: whether it has `--json`.
     """
-    signature = inspect.signature(body, eval_str=True)
     shared = {"quiet": Quiet, "verbose": Verbose}
     shared |= {"as_json": AsJson} if as_json else {}
     shared |= {"force": Force} if output is not None or files else {}
-    asked = [
-        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-        for word, kind in shared.items()
-    ]
-
-    about, described = _described(body.__doc__ or "")
-    own = {one.name: one for one in _spread_out(signature.parameters.values())}
-    own |= {
-        name: own[name].replace(annotation=Annotated[own[name].annotation, option])
-        for name, option in described.items()
-    }
+    signature, own, about = _own_options(body, output)
     how_read = next((one.name for one in signature.parameters.values() if one.annotation is HowRead), None)
-    if output is not None and own["out"].annotation is Path:
-        option = Annotated[Path | None, typer.Option("--out", help=f"{output.help} Default: a dated name.")]
-        own["out"] = own["out"].replace(annotation=option, default=None)
 
     @functools.wraps(body)
     def command(context: typer.Context, **given: Any) -> None:
@@ -142,11 +128,32 @@ def add_command(
             raise typer.Exit(result.status)
 
     command.__doc__ = about
+    asked = [
+        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for word, kind in shared.items()
+    ]
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     everything = [context, *own.values(), *asked]
     command.__signature__ = signature.replace(parameters=everything)  # type: ignore[attr-defined]
     command.__annotations__ = {one.name: one.annotation for one in everything}
     app.command(name)(command)
+
+
+def _own_options(
+    body: Callable[..., Result], output: Output | None
+) -> tuple[inspect.Signature, dict[str, inspect.Parameter], str]:
+    """Signature of a command's body, its options by name, described by its docstring, and its help."""
+    signature = inspect.signature(body, eval_str=True)
+    about, described = _described(body.__doc__ or "")
+    own = {one.name: one for one in _spread_out(signature.parameters.values())}
+    own |= {
+        name: own[name].replace(annotation=Annotated[own[name].annotation, option])
+        for name, option in described.items()
+    }
+    if output is not None and own["out"].annotation is Path:
+        option = Annotated[Path | None, typer.Option("--out", help=f"{output.help} Default: a dated name.")]
+        own["out"] = own["out"].replace(annotation=option, default=None)
+    return signature, own, about
 
 
 def _described(docstring: str) -> tuple[str, dict[str, Any]]:

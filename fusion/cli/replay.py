@@ -24,6 +24,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
+    from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
     from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.replay import ReplayResult
@@ -94,56 +95,68 @@ def replay(
             drive.
     """
     from terrafusion.datasets.core.errors import errors_of
-    from terrafusion.fusion.config.estimator_config import MODES
-    from terrafusion.fusion.grounds.file import read_grounds, save_grounds
+    from terrafusion.fusion.grounds.file import read_grounds
     from terrafusion.fusion.metrics.scores import parse_outage
     from terrafusion.fusion.replay import replay as run
+
+    _check_usage(mode, rerun)
+    turned = None if declination is None else math.radians(declination)
+    outages = [parse_outage(text) for text in gnss_outage or []]
+    memory = None if grounds is None else read_grounds(grounds)
+    recording, findings = _opened(log, vehicle, how, calibrate)
+    with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
+        result = run(
+            recording, vehicle=vehicle, mode=mode, policy=policy, outages=outages, batch=batch,
+            magnetometer=magnetometer or declination is not None,
+            settings={"calibrate": calibrate, "declination_rad": turned}, grounds=memory, findings=findings,
+            progress=progress,
+        )  # fmt: skip
+    unseen = _write(result, out, mcap, rerun, grounds)
+    return _shown(result, findings, unseen, out)
+
+
+def _check_usage(mode: str, rerun: Path | None) -> None:
+    """Refuse an unknown mode, and a file for Rerun where that is not installed."""
+    from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.reports.rerun_log import require_rerun
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
     if rerun is not None:
         require_rerun()
-    turned = None if declination is None else math.radians(declination)
-    outages = [parse_outage(text) for text in gnss_outage or []]
-    memory = None if grounds is None else read_grounds(grounds)
+
+
+def _opened(log: str, vehicle: str | None, how: HowRead, calibrate: bool) -> tuple[Recording, list[Finding]]:
+    """The log and the findings of the log checks; one whose numbers would mislead is refused."""
     rig = load_rig(vehicle)
     recording = how.open(log, rig)
-    findings = refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
-    with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
-        result = run(
-            recording,
-            vehicle=vehicle,
-            mode=mode,
-            policy=policy,
-            outages=outages,
-            batch=batch,
-            progress=progress,
-            magnetometer=magnetometer or declination is not None,
-            settings={"calibrate": calibrate, "declination_rad": turned},
-            grounds=memory,
-            findings=findings,
-        )
-    if grounds is not None and result.grounds is not None:
-        save_grounds(result.grounds, grounds)
-    unseen = _write(result, out, mcap, rerun)
-    warnings = [_warning(finding, result.learned) for finding in findings]
-    lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
-    done = f"written to {out}"
-    short = f"{result.verdict.lines()[0]}; {done}"
-    return Result(lines, done, read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
+    return recording, refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
 
 
-def _write(result: ReplayResult, out: Path, mcap: bool, rerun: Path | None) -> list[str]:
+def _write(
+    result: ReplayResult, out: Path, mcap: bool, rerun: Path | None, grounds: Path | None
+) -> list[str]:
     """All files of a replay; returns lines on what the bag could not hold."""
+    from terrafusion.fusion.grounds.file import save_grounds
     from terrafusion.fusion.reports.replay import write_replay
     from terrafusion.fusion.reports.rerun_log import write_rerun
 
+    if grounds is not None and result.grounds is not None:
+        save_grounds(result.grounds, grounds)
     write_replay(out, result, {"command": command_line()})
     unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
     return unseen
+
+
+def _shown(result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[str], out: Path) -> Result:
+    """What the command prints, the verdict first."""
+    warnings = [_warning(finding, result.learned) for finding in findings]
+    lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
+    done = f"written to {out}"
+    short = f"{result.verdict.lines()[0]}; {done}"
+    return Result(lines, done, read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
 
 
 def _warning(finding: Finding, learned: Sequence[NumberAfterDrive]) -> str:

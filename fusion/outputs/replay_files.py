@@ -78,12 +78,6 @@ def build_metrics(
     latencies = np.asarray(latencies_ms, dtype=float).ravel()
     latencies = latencies[np.isfinite(latencies)]
     p50, p99 = np.percentile(latencies, [50.0, 99.0]) if len(latencies) else (0.0, 0.0)
-    judged: dict[str, Any] = {}
-    if verdict is not None:
-        judged["verdict"] = {"value": verdict.value, "reasons": list(verdict.reasons)}
-        judged["assumed"] = [finite(dataclasses.asdict(one)) for one in assumed]
-    if baselines is not None:
-        judged["baselines"] = finite(baselines.record())
     return {
         "schema": SCHEMA,
         "log": log,
@@ -97,21 +91,37 @@ def build_metrics(
         "terrain": {name: min(1.0, _at_least_zero(share)) for name, share in terrain.items()},
         "weights": {"changes": int(changes)},
         "rejected": {"gnss": 0, "wheels": 0} | {name: int(count) for name, count in rejected.items()},
+        **_scored(scores),
+        "calibration": [finite(row) for row in calibration],
+        "status": {"value": status["value"], "message": status["message"]},
+        "notes": [*notes, *(note for note in scores.notes if note not in notes)],
+        **_judged(verdict, assumed, baselines),
+    }
+
+
+def _scored(scores: Scores) -> dict[str, Any]:
+    numbers = ("ate_m", "rpe_percent", "yaw_rmse_rad", "velocity_rmse_mps", "nees_mean")
+    return {
         "against": scores.against,
-        "ate_m": finite(scores.ate_m),
-        "rpe_percent": finite(scores.rpe_percent),
-        "yaw_rmse_rad": finite(scores.yaw_rmse_rad),
-        "velocity_rmse_mps": finite(scores.velocity_rmse_mps),
-        "nees_mean": finite(scores.nees_mean),
+        **{name: finite(getattr(scores, name)) for name in numbers},
         "held_out": None if scores.held_out is None else finite(dataclasses.asdict(scores.held_out)),
         "outages": [finite(dataclasses.asdict(outage)) for outage in scores.outages],
         "consistency": [
             finite(dataclasses.asdict(row)) | {"verdict": row.verdict()} for row in scores.consistency
         ],
-        "calibration": [finite(row) for row in calibration],
-        "status": {"value": status["value"], "message": status["message"]},
-        "notes": [*notes, *(note for note in scores.notes if note not in notes)],
-    } | judged
+    }
+
+
+def _judged(
+    verdict: Verdict | None, assumed: Sequence[Assumption], baselines: Baselines | None
+) -> dict[str, Any]:
+    judged: dict[str, Any] = {}
+    if verdict is not None:
+        judged["verdict"] = {"value": verdict.value, "reasons": list(verdict.reasons)}
+        judged["assumed"] = [finite(dataclasses.asdict(one)) for one in assumed]
+    if baselines is not None:
+        judged["baselines"] = finite(baselines.record())
+    return judged
 
 
 def terrain_shares(estimate: Estimate) -> dict[str, float]:
