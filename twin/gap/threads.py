@@ -1,7 +1,5 @@
 """Linear algebra in the calling thread."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Writes a vehicle file with the effects found: as numbers that it has, or in its section `effects`."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from pathlib import Path

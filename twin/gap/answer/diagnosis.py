@@ -1,7 +1,5 @@
 """`GapDiagnosis`: the result of a diagnosis, and its form in `diagnosis.json`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

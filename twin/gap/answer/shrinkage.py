@@ -5,8 +5,6 @@ one left out, with theta and poses fitted anew in both arms. A single run is sco
 interval.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

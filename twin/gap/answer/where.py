@@ -5,8 +5,6 @@ A cell's share is its part of the excess of squared errors. Its p-value holds fo
 greatest standardised excess over all cells, of other choices of runs (max-T, Westfall and Young 1993).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Trials given to a diagnosis and its opponent, and their answers: one line of JSON a trial."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

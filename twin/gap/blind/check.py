@@ -4,8 +4,6 @@ from terrafusion.twin.gap.blind.check import run_blind_check
 scores = run_blind_check("out", diagnose, scale=QUICK)
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The headline of a blind check: each figure of all methods, with its interval and its target."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -6,8 +6,6 @@ together (bounded Gauss-Newton with a line search) on rollouts of the same twin.
 change over sigma is significant (Student's t, Bonferroni over all parameters); the largest is ranked first.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Shares with their intervals, and how well stated confidence agrees with what came true."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """All trials judged, as numbers: what `blind.json` holds."""
 
-from __future__ import annotations
-
 import statistics
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

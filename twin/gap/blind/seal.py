@@ -10,8 +10,6 @@ This guards against a diagnosis (or its author) that reads the labels by acciden
 who draws the plan again from a known seed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ d' is the shift of the output of a matched filter over its scatter in null runs 
 a trial together. `python -m tests.studies.blind.sensitivity` measures `sensitivity.yaml`.
 """
 
-from __future__ import annotations
-
 import functools
 from importlib import resources
 from typing import Any

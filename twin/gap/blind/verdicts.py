@@ -1,7 +1,5 @@
 """One answer beside its truth: what was right in it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

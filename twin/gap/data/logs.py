@@ -1,7 +1,5 @@
 """From recordings to logs of one twin: geometry, soils, common channels."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence

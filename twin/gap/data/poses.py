@@ -5,8 +5,6 @@ fault. A linearisation about that pose would show a gyro bias in GNSS positions.
 turns and shifts as a whole, so it is aligned with the fixes by a rigid transform instead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Maps each observed sample of a log to the samples of the twin's run that it averages."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary

@@ -5,8 +5,6 @@ at each window. An effect in a compiled graph costs time in every run of it, so 
 few effects; the groups follow from the candidates alone and each graph is compiled once.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ a third of a second. A fit through the twin uses the delay itself. IMU readings 
 positions are reset at each window and are extrapolated before its start.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ Each function adds a constant, speed, turn rate, their rates or products, to one
 any kind shows as some dependence of the residuals on the input.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ changes in all other samples. Only channels in which the references have such ou
 noise is normal, a large error is a finding.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -5,8 +5,6 @@ is simulated on the soil that fits each run, as long as that reduces the errors,
 back to the model's soil linearly.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 Sensitivities are finite differences of a batched rollout with one run an effect.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
