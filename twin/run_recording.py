@@ -16,14 +16,12 @@ from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.run_setup import RunSetup
 from terrafusion.twin.scenario.commands import DrivenStates
-from terrafusion.twin.sensors.current import motor_channel
+from terrafusion.twin.sensors.drive import motor_channel, steering_channel, wheels_channel
 from terrafusion.twin.sensors.effects import with_sensor_effects
-from terrafusion.twin.sensors.encoders import wheels_channel
 from terrafusion.twin.sensors.environment import barometer_channel, magnetometer_channel
 from terrafusion.twin.sensors.gnss import gnss_channel
 from terrafusion.twin.sensors.imu import imu_channel
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate
-from terrafusion.twin.sensors.steering import steering_channel
 
 START_NS = 1_704_067_200 * 10**9
 """Simulated drives start on 2024-01-01 00:00 UTC."""

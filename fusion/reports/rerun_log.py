@@ -29,7 +29,7 @@ from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.outputs.replay_files import is_local
 from terrafusion.fusion.reports.plots import style
-from terrafusion.fusion.reports.plots.ellipses import ellipse_rows, ellipses, rejected_fixes
+from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, rejected_fixes
 
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import ReplayResult

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
-from terrafusion.fusion.reports.plots import study_field as field_plots
 from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
 from terrafusion.twin.study.published import CASES, FRICTION, SCENARIO, TITLE, VEHICLE, platform_figures
@@ -158,11 +157,11 @@ def _figures(study: Study) -> dict[str, Figure]:
         "noise": plots.plot_noise(study.noise),
         "mobility": plots.plot_mobility(study.batch),
         "energy": plots.plot_energy(study.batch, study.over_slip),
-        "acceleration": field_plots.plot_acceleration(drive),
-        "trace": field_plots.plot_trace(drive),
-        "velocity": field_plots.plot_velocity(drive),
-        "ground_speed": field_plots.plot_ground_speed(drive),
-        "imu_speed": field_plots.plot_imu_speed(study.field),
+        "acceleration": plots.plot_acceleration(drive),
+        "trace": plots.plot_trace(drive),
+        "velocity": plots.plot_velocity(drive),
+        "ground_speed": plots.plot_ground_speed(drive),
+        "imu_speed": plots.plot_imu_speed(study.field),
     }
 
 

@@ -4,19 +4,33 @@
     from terrafusion.twin.sweep.run import run_sweep
     table = run_sweep(load_sweep("friction_slope"), "out", jobs=2)     # a pyarrow Table
 
-The rows and their order depend on the sweep alone, not on the number of
-workers, the backend or interruptions.
+The rows and their order depend on the sweep alone, not on the number of workers, the backend or
+interruptions. Files of a sweep:
+
+    sweep.json        the sweep, its hash, whether it is complete; the same on every machine
+    parts/            one Parquet file a chunk, written beside its place and moved there when whole
+    runs.parquet      all rows, when all chunks are there; the parts are then removed
+
+A killed process loses only the chunks it was computing.
 """
 
+import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.files import unwritable, write_atomically
+from terrafusion.datasets.core.scratch import is_part
 from terrafusion.twin.executors import open_workers
+from terrafusion.twin.model.version import model_sha256, version
 from terrafusion.twin.sweep.plan import MAX_RUNS, Sweep, SweepPoint
-from terrafusion.twin.sweep.rows import Row, run_chunk
-from terrafusion.twin.sweep.store import RUNS_FILE, Store
+from terrafusion.twin.sweep.rows import Row, columns, run_chunk
+
+SCHEMA = 1
+SWEEP_FILE, RUNS_FILE, PARTS_FOLDER = "sweep.json", "runs.parquet", "parts"
+_HASH_KEY = b"terrafusion_sweep_sha256"
 
 
 def run_sweep(
@@ -80,3 +94,129 @@ def read_table(out: Path | str) -> Any:
 
 def _numbered(sweep: Sweep, number: int, cases: Sequence[SweepPoint]) -> tuple[int, list[Row]]:
     return number, run_chunk(sweep, cases)
+
+
+class Store:
+    """The folder of one sweep.
+
+    Raises:
+        TerrafusionError: pyarrow is missing, or the folder cannot be written.
+        ConfigError: the folder holds another sweep.
+    """
+
+    def __init__(self, folder: Path, sweep: Sweep, chunks: Sequence[range]) -> None:
+        _require_pyarrow()
+        self.folder, self.sweep, self.chunks = folder, sweep, chunks
+        self.sha256 = sweep.sha256()
+        self._check_same()
+        try:
+            (folder / PARTS_FOLDER).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unwritable(folder, error) from None
+        if not self.complete():
+            self._write_about(None)
+
+    def complete(self) -> bool:
+        """Whether the table of all runs is there."""
+        return self._holds(self.folder / RUNS_FILE, self.sweep.runs)
+
+    def missing(self) -> list[int]:
+        """Numbers of the chunks that are still to be computed."""
+        if self.complete():
+            return []
+        return [i for i, chunk in enumerate(self.chunks) if not self._holds(self._part(i), len(chunk))]
+
+    def write_part(self, number: int, rows: Sequence[Row]) -> None:
+        """Write the rows of one chunk."""
+        self._write_table(self._part(number), self._table(rows))
+
+    def assemble(self) -> None:
+        """Join the parts, in the order of the runs, into the table of all runs; remove the parts."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if not self.complete():
+            parts = [pq.read_table(self._part(i)) for i in range(len(self.chunks))]
+            self._write_table(self.folder / RUNS_FILE, pa.concat_tables(parts).combine_chunks())
+            counts = pq.read_table(self.folder / RUNS_FILE, columns=["status"])["status"].to_pylist()
+            self._write_about({word: counts.count(word) for word in sorted(set(counts))})
+        shutil.rmtree(self.folder / PARTS_FOLDER, ignore_errors=True)
+
+    def _part(self, number: int) -> Path:
+        return self.folder / PARTS_FOLDER / f"part-{number:06d}.parquet"
+
+    def _check_same(self) -> None:
+        about = self.folder / SWEEP_FILE
+        if not about.is_file():
+            if self.folder.is_dir() and not all(is_part(path.name) for path in self.folder.iterdir()):
+                raise ConfigError(
+                    "the folder is not empty and holds no sweep", file=self.folder, remedy="give a new folder"
+                )
+            return
+        try:
+            found = json.loads(about.read_text(encoding="utf-8"))
+            known = (found["sha256"], found["terrafusion"], found["model_sha256"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"cannot be read ({error})", file=about, remedy="give a new folder") from None
+        begun = any((self.folder / PARTS_FOLDER).glob("part-*.parquet")) or (self.folder / RUNS_FILE).exists()
+        if known[0] == self.sha256 or not begun:
+            return
+        same_code = known[1:] == (version(), model_sha256())
+        what = "another sweep" if same_code else "a sweep of another version of terrafusion"
+        raise ConfigError(
+            f"the folder holds {what} (sha256 {str(known[0])[:12]}, now {self.sha256[:12]})",
+            file=self.folder,
+            remedy="give a new --out, or remove the folder to begin anew",
+        )
+
+    def _write_about(self, outcome: dict[str, int] | None) -> None:
+        about = {
+            "schema": SCHEMA,
+            "name": self.sweep.name,
+            "sha256": self.sha256,
+            "terrafusion": version(),
+            "model_sha256": model_sha256(),
+            "runs": self.sweep.runs,
+            "complete": outcome is not None,
+            "outcome": outcome,
+            "columns": {c.name: c.about for c in columns(self.sweep.sensors)},
+            "config": self.sweep.config(),
+        }
+        text = json.dumps(about, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        write_atomically(self.folder / SWEEP_FILE, lambda part: part.write_text(text, encoding="utf-8"))
+
+    def _holds(self, file: Path, rows: int) -> bool:
+        """Whether `file` is a whole table of this sweep with so many rows."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            about = pq.read_metadata(file)
+        except (OSError, pa.ArrowInvalid):  # missing, or cut short by a disk that lost power
+            return False
+        return about.num_rows == rows and (about.metadata or {}).get(_HASH_KEY) == self.sha256.encode()
+
+    def _table(self, rows: Sequence[Row]) -> Any:
+        import pyarrow as pa
+
+        kinds = {"int": pa.int64(), "float": pa.float64(), "text": pa.string()}
+        fields = [
+            pa.field(c.name, kinds[c.kind], metadata={"about": c.about}) for c in columns(self.sweep.sensors)
+        ]
+        schema = pa.schema(fields, metadata={_HASH_KEY: self.sha256.encode()})
+        return pa.Table.from_pylist(list(rows), schema=schema)
+
+    def _write_table(self, file: Path, table: Any) -> None:
+        import pyarrow.parquet as pq
+
+        write_atomically(file, lambda part: pq.write_table(table, part))
+
+
+def _require_pyarrow() -> None:
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        raise TerrafusionError(
+            "a sweep writes Parquet, and the package pyarrow is not installed",
+            remedy="pip install 'terrafusion[parquet]'",
+        ) from None

@@ -16,7 +16,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import state_slice
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
-from terrafusion.twin.sensors.encoders import counted
+from terrafusion.twin.sensors.drive import counted
 from terrafusion.twin.sensors.gnss import FIX_LEVELS, Sky, fix_classes
 from terrafusion.twin.sensors.imu import triad
 from terrafusion.twin.sensors.noise import NoiseStreams, gauss_markov

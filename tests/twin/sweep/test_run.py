@@ -196,7 +196,7 @@ def test_a_sweep_of_another_version_is_refused(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_sweep(load_sweep(file), tmp_path / "out")
-    for name in ("plan", "store"):
+    for name in ("plan", "run"):
         monkeypatch.setattr(f"terrafusion.twin.sweep.{name}.model_sha256", lambda: "f" * 64)
     with pytest.raises(ConfigError, match="another version of terrafusion"):
         run_sweep(load_sweep(file), tmp_path / "out")
