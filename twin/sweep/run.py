@@ -47,7 +47,7 @@ def run_sweep(
 
     Args:
         sweep: what to run.
-        out: folder of the results, see `sweep.store`.
+        out: folder of the results, see the files above.
         jobs: processes on this machine; a Dask cluster has its own number.
         backend: "loky" (this machine) or "dask".
         address: of the Dask scheduler, such as "tcp://10.0.0.5:8786".
