@@ -108,16 +108,16 @@ def replay(
 
     estimate = run.estimate((*drive.notes, *run.notes(), *drive.unused))
     scores = drive.score(estimate, estimator)
-    rivals = drive.baselines(estimate, scores, estimator)
+    alone = drive.baselines(estimate, scores, estimator)
 
     rig = drive.config.rig
     found = run_checks(recording, rig) if findings is None else findings
     delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
-    verdict = judge(Run(recording, estimate, scores, rivals, drive.used, found, rig, delay_s, corrected))
+    verdict = judge(Run(recording, estimate, scores, alone, drive.used, found, rig, delay_s, corrected))
     return ReplayResult(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
         drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
-        rivals, verdict, drive.assumed, estimator.learned.table(), estimator.weights.learned_grounds(),
+        alone, verdict, drive.assumed, estimator.learned.table(), estimator.weights.learned_grounds(),
     )  # fmt: skip
 
 

@@ -66,13 +66,13 @@ class LearnedNumber:
 
     @property
     def observed(self) -> bool:
-        """Whether the logs tell it."""
+        """Whether the logs determine it."""
         return self.gained_nats >= OBSERVED_NATS
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorCalibration:
-    """What logs of one robot tell of its sensors.
+    """What logs of one robot show of its sensors.
 
     Attributes:
         vehicle: as it was known before, with the geometry `overrides` that the logs report.
@@ -90,7 +90,7 @@ class SensorCalibration:
     notes: tuple[str, ...]
 
     def unobserved(self) -> list[str]:
-        """Numbers that the logs do not tell."""
+        """Numbers that the logs do not determine."""
         return [name for name, number in self.numbers.items() if not number.observed]
 
     def known(self) -> SensorNumbers:

@@ -30,12 +30,12 @@ from terrafusion.datasets.core.recording import Recording
 
 LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
 """Smaller lags are no finding; slip distorts the speed of wheels, so that theirs may be larger."""
-SURELY_S = 0.5
+ERROR_FROM_S = 0.5
 """An interval that is all beyond this is an error."""
 SLIDING_S = 2.0
 """The same where the others lag behind the wheels, as they do where a robot skids: at 1 m/s2 of traction it
 takes 3 s to reach 3 m/s, a mean delay of half of that."""
-LEAST_LATE_S, SURELY_LATE_S = 0.3, 0.2
+LEAST_LATE_S, SIGNIFICANT_S = 0.3, 0.2
 """Fixes count as late from the first on, with the interval of the delay beyond the second."""
 CALIBRATED_S = 3.0
 """Late fixes are no error up to this: the estimator finds such a delay by itself."""
@@ -91,7 +91,7 @@ def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
     path = path_by(context.recording, "gnss")
     model = path_model(context, path) if path is not None else None
-    if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SURELY_LATE_S):
+    if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SIGNIFICANT_S):
         return
     late = model.delay_s
     yield Finding(
@@ -112,10 +112,10 @@ def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pai
     if name == pair[0]:
         lag = Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
     ahead = name if lag.seconds < 0.0 else against
-    surely = CALIBRATED_S if name == "gnss" else SLIDING_S if ahead == "wheels" else SURELY_S
+    limit_s = CALIBRATED_S if name == "gnss" else SLIDING_S if ahead == "wheels" else ERROR_FROM_S
     return Finding(
         "clock-offset",
-        "error" if _distance_to_zero_s(lag) > surely else "warning",
+        "error" if _distance_to_zero_s(lag) > limit_s else "warning",
         name,
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",

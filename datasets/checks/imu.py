@@ -60,7 +60,7 @@ WINDOW_S, SMOOTH_S = 0.5, 8.0
 LEAST_C, SIGMAS = 0.25, 5.0
 """A correlation counts above the first, and above this many standard errors of noise."""
 NEAR_AXIS = np.radians(25.0)
-SURELY_TURNED = np.radians(12.0)
+SIGNIFICANT_TURN = np.radians(12.0)
 """Slopes, and lever arms of the IMU, seem to turn those of good field logs by up to 8 deg."""
 BLOCK, LEAST_BLOCKS = 20, 4
 """Windows of a block of the bootstrap, and blocks that are needed."""
@@ -308,7 +308,7 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     found = heading(context)
     if found is None or found.angle is None:
         return
-    angle, sure = found.angle, abs(found.angle) - found.spread > SURELY_TURNED
+    angle, sure = found.angle, abs(found.angle) - found.spread > SIGNIFICANT_TURN
     if abs(angle) < 0.25 * np.pi and not sure:
         return
     quarter = round(angle / (0.5 * np.pi)) % 4

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
 
-MOST_SLIP_FREE, SURELY_MORE = 1.04, 1.02
+MOST_SLIP_FREE, SIGNIFICANT_RATIO = 1.04, 1.02
 """Driven wheels are never slower than the ground: a ratio above the first whose interval excludes the
 second is no slip, but a wheel larger than stated."""
 LARGEST_RADIUS_ERROR = 2.2
@@ -85,7 +85,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
             f"multiply them by {factor:.6g}" if len(units) == 1 else "give the unit: more than one fits",
             scaled("wheels", factor, "speed") if len(units) == 1 else None,
         )  # fmt: skip
-    elif scale.ratio > MOST_SLIP_FREE * known and scale.low > SURELY_MORE * known:
+    elif scale.ratio > MOST_SLIP_FREE * known and scale.low > SIGNIFICANT_RATIO * known:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
     elif (scale.ratio < SMALL * known or scale.high < FIRM_SLIP * known) and is_firm(context.recording):
         fitting = f"radius ({radius * scale.ratio:.4f} m fits)" if wheels.unit == "radps" else "speeds"

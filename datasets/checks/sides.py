@@ -28,9 +28,9 @@ WINDOW_S, BLOCK, LEAST_BLOCKS = 1.0, 10, 8
 LEAST_R, LEAST_MPS, LEAST_TRACK_M = 0.6, 0.1, 0.2
 BIAS_RADPS, REST_BIAS_RADPS, MOST_BIAS_RADPS = 0.005, 0.0005, 0.02
 """1 sigma of the gyro's bias where the log shows no rest, and where it does; more is no bias."""
-LARGE, SURELY, WIDEST, MOST = 0.025, 0.015, 0.05, 0.3
+LARGE, SIGNIFICANT, WIDEST, MOST = 0.025, 0.015, 0.05, 0.3
 """A difference of radii counts from the first on, with its interval beyond the second and narrower than the
-third: in one long bend it cannot be told from the track. Tyres of one robot
+third: in one long bend it cannot be distinguished from the track. Tyres of one robot
 differ by up to that much: a Warthog's by 1.7 % (norlab_drive)."""
 SLIP_FREE = 1.005
 
@@ -55,7 +55,7 @@ def check_radii(context: CheckContext) -> Iterator[Finding]:
     found = radius_difference(context)
     if found is None or not LARGE < abs(found.value) < MOST:
         return
-    if not found.is_beyond(SURELY) or found.high - found.low > WIDEST:
+    if not found.is_beyond(SIGNIFICANT) or found.high - found.low > WIDEST:
         return
     fast, slow = ("right", "left") if found.value > 0.0 else ("left", "right")
     known = [scale.ratio for scale, _ in scales(context)]

@@ -49,7 +49,7 @@ def repair_together(
         times: (N,) int64 by channel, in the order of the rows.
         beside: times of the same rows on another clock of the same rate. A jump ahead of the first
             that this one does not have is a step and is removed too; without it, a jump ahead cannot
-            be told from a gap in the data.
+            be distinguished from a gap in the data.
 
     Returns:
         Repaired times by channel (the same arrays where nothing changed), and all jumps. Rows that

@@ -83,7 +83,7 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
     return recording_of(
-        channels, meta, folder.resolve().name, [*reader.notes, *source.notes, *source.strangers()]
+        channels, meta, folder.resolve().name, [*reader.notes, *source.notes, *source.unknown_files()]
     )
 
 
@@ -156,7 +156,7 @@ class _Folder:
                 raise DataError("is no file", file=path, remedy="give a CSV file, or remove it")
         return plain if plain.exists() else packed if packed.exists() else None
 
-    def strangers(self) -> Iterator[str]:
+    def unknown_files(self) -> Iterator[str]:
         """A note for each CSV that is no channel: a misspelt name would otherwise go unseen."""
         for path in sorted(self.folder.iterdir()):
             stem = path.name.removesuffix(".gz").removesuffix(".csv")

@@ -13,7 +13,7 @@ from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedSensors(SensorCalibration):
-    """What logs tell of a robot's sensors: `numbers`, `summary` and `write`."""
+    """What logs show of a robot's sensors: `numbers`, `summary` and `write`."""
 
     def write(self, path: str | Path) -> Path:
         """Write the vehicle file, for `vehicle=` everywhere; see `robot_file.write_robot`."""

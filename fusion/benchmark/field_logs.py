@@ -186,7 +186,7 @@ def reference_of(recording: Recording) -> str:
 
 
 def ground_of(log: str, recording: Recording) -> str:
-    """ "firm" or "slipping" by the log's label, else by its set; "" where neither tells."""
+    """ "firm" or "slipping" by the log's label, else by its set; "" without both."""
     labels = {recording.terrain_name} - {""}
     if recording.terrain is not None:
         labels |= set(map(str, recording.terrain.label.tolist()))

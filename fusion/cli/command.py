@@ -27,7 +27,7 @@ INTERRUPTED = 130
 
 @dataclass(frozen=True)
 class Result:
-    """What a command has to tell.
+    """What a command reports.
 
     Attributes:
         lines: printed in full, unless `--quiet`.

@@ -54,7 +54,7 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
     if contents.unused:
         print_lines(entry("not used", "dim", ", ".join(contents.unused)))
     chosen = dict(topics)
-    for kind, names in contents.rivals.items():
+    for kind, names in contents.candidates.items():
         rates = [f"{name} ({clocks[name]['rate_hz'] or 0.0:.3g} Hz)" for name in names]
         if not interactive():
             raise DataError(

@@ -209,7 +209,7 @@ def summary(result: ReplayResult) -> list[str]:
         )
     if scores.against == "truth" and scores.ate_m is not None:
         lines.append(f"against truth: position error {scores.ate_m:.3f} m (root mean square)")
-    lines += _rivals(result.baselines)
+    lines += _baseline_lines(result.baselines)
     for outage in scores.outages:
         if outage.end_error_m is None or outage.median_m is None:
             lines.append(f"outage at {outage.start_s:g} s: nothing to score against")
@@ -226,7 +226,7 @@ def summary(result: ReplayResult) -> list[str]:
     return lines
 
 
-def _rivals(baselines: Baselines) -> list[str]:
+def _baseline_lines(baselines: Baselines) -> list[str]:
     """The errors of the baselines, where they are scored."""
     named = (("dead reckoning", baselines.dead_reckoning_m), ("the receiver alone", baselines.gnss_m))
     shown = [f"{name} {error_m:.3f} m" for name, error_m in named if error_m is not None]

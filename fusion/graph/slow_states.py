@@ -39,7 +39,7 @@ YAW_SCALE_ROBOT = 0.2
 SIDE_SLIP_TIME_S = 5.0
 SIDE_SLIP_SHARE = 0.3
 """Share of the ground's side-slip that lasts; all of it is new at every keyframe besides. Tuned on the twin:
-more cannot be told from heading on a straight drive."""
+more cannot be distinguished from heading on a straight drive."""
 SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
 """Side-slip on a cross slope over the slip on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69
 on medium sand across 15 deg), and its relative error (assumed)."""

@@ -121,7 +121,7 @@ class Ground:
             self, signature=self.signature.plus(signature, weight), first=first, last=date or self.last
         )
 
-    def slid(self, friction: Array, weight: float) -> Ground:
+    def with_friction(self, friction: Array, weight: float) -> Ground:
         """With friction probabilities (10,) of one more window."""
         n = min(self.friction_windows, MOST_WINDOWS) + weight
         mean = self.friction + weight / n * (friction - self.friction)

@@ -127,7 +127,7 @@ class GroundMemory:
         if best:
             weight = float(self.belief[best])
             ground = self.grounds[best - 1].seen(signature, weight, date)
-            self.grounds[best - 1] = ground if friction is None else ground.slid(friction, weight)
+            self.grounds[best - 1] = ground if friction is None else ground.with_friction(friction, weight)
 
     def _found(self, date: str) -> None:
         names = {g.name for g in self.grounds}

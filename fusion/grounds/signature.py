@@ -19,7 +19,7 @@ friction by fixes, which tells grounds apart that are learned and is missing in 
 
 BANDS_HZ = ((3.0, 8.0), (8.0, 14.0), (14.0, 45.0))
 LEAST_YAW_RADPS, LEAST_SURGE_MPS2 = 0.15, 0.3
-"""Least yaw rate and acceleration of the wheels whose share can be told (assumed)."""
+"""Least yaw rate and acceleration of the wheels whose share is measurable (assumed)."""
 MOST_SHARE = 1.5
 STANDS = 0.02
 """Speed, m/s, and yaw rate, rad/s, below which a robot stands."""

@@ -1,4 +1,4 @@
-"""What the user says of a robot that no log tells, and what is assumed where nothing is said."""
+"""What the user says of a robot that no log shows, and what is assumed of the rest."""
 
 import math
 from dataclasses import dataclass, field

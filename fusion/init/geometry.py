@@ -19,7 +19,7 @@ LEAST_RADIUS_SIGMA, LEAST_TRACK_SIGMA = 0.005, 0.03
 LEAST_RADIUS_M, MOST_RADIUS_M = 0.03, 1.0
 """Wheels of ground robots; a radius beyond is a unit other than rad/s."""
 LEAST_FACTOR, MOST_FACTOR = 0.05, 2.0
-"""A yaw factor beyond shows a wrong track or swapped sides, of which the log checks tell."""
+"""A yaw factor beyond shows a wrong track or swapped sides, which the log checks report."""
 FLAGS = {
     "wheel_radius_m": "--wheel-radius",
     "track_m": "--track",

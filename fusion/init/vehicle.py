@@ -222,7 +222,7 @@ def _read(open_log: Open, draft: Draft, file: Path) -> tuple[Recording, Rig]:
 def _calibrated(
     recording: Recording, file: Path, progress: Callable[[float], None] | None
 ) -> tuple[SensorCalibration | None, tuple[str, ...]]:
-    """What the log tells of its sensors, and notes."""
+    """What the log shows of its sensors, and notes."""
     if recording.gnss is None or not len(recording.gnss):
         return None, ("no fixes: wheel scale, antenna, gyro scale and delays are not measured",)
     try:
@@ -232,7 +232,7 @@ def _calibrated(
 
 
 def _learned_lines(calibration: SensorCalibration, draft: Draft) -> Draft:
-    """Lines of the numbers that the log tells; the user's own and those measured directly stay."""
+    """Lines of the numbers that the log determines; the user's own and those measured directly stay."""
     found: Draft = {}
     for name, number in vars(calibration.known()).items():
         if number is None or number.known != "calibrated":

@@ -92,7 +92,7 @@ class Newest:
 
 @dataclass
 class Leap:
-    """Samples far ahead of all others; a clock that was wrong once is told by them from a pause of the log.
+    """Samples far ahead of all others; they distinguish a clock that was wrong once from a pause of the log.
 
     Attributes:
         newest: of all streams.

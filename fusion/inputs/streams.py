@@ -77,7 +77,7 @@ def usual_interval_s(times: list[int]) -> float:
 
 
 def longest_gap_s(times: list[int]) -> float:
-    """Longest time between two samples of a stream over which it still tells the motion, s."""
+    """Longest time between two samples of a stream over which it still shows the motion, s."""
     return max(USUAL_GAP_S, GAP_INTERVALS * min(usual_interval_s(times), SLOWEST_INTERVAL_S))
 
 

@@ -85,13 +85,13 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
     antenna_m = rig.sensors.gnss.antenna_m
     estimate = history.estimate(estimator.weights.detector.classes, [], ())
     scores = score(estimate, recording, antenna_m=estimator.gnss.antenna_places, aligned=local)
-    rivals = baselines(
+    alone = baselines(
         recording, estimate, scores, recording.gnss, wheel_radius_m=rig.wheel_radius_m, track_m=rig.track_m,
         antenna_m=antenna_m, aligned=local,
     )  # fmt: skip
     found = run_checks(recording, rig)
     delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
-    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig, delay_s, corrected))
+    return judge(Run(recording, estimate, scores, alone, recording.gnss, found, rig, delay_s, corrected))
 
 
 def run(

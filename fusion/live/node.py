@@ -50,7 +50,7 @@ LOOK_S = 1.0
 DIAGNOSTICS_S = 1.0
 MISSING_NS = 5_000_000_000
 """Messages are held for so long while a sensor is missing."""
-MOST_SAID = 200
+MOST_REPORTED = 200
 """Kinds of lines that are reported; later ones are only counted."""
 Say = Callable[[str], None]
 Publish = Callable[[str, str, bytes], None]
@@ -120,7 +120,7 @@ class LiveNode:
         self._sensors: Sensors | None = None
         self.estimator: Estimator | None = None
         self.counts: Counter[str] = Counter(received=0, refused=0)
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._topics: set[str] = set()
         self._problem, self.running = "", True
         self._now_s = self._looked_s = self._diagnosed_s = time.monotonic()
@@ -351,8 +351,8 @@ class LiveNode:
         """Say a line once; what differs in its numbers alone is the same."""
         self._problem = line
         pattern = re.sub(r"[\d.+-]+", "#", line)
-        if pattern not in self._said and len(self._said) < MOST_SAID:
-            self._said.add(pattern)
+        if pattern not in self._reported and len(self._reported) < MOST_REPORTED:
+            self._reported.add(pattern)
             self._say(line)
 
 

@@ -119,7 +119,7 @@ def baselines(
 
 
 def dead_reckoning(recording: Recording, wheel_radius_m: float, track_m: float) -> ReckonedPath | None:
-    """The path by wheels and gyro z, else by the wheels alone; None where nothing tells the heading."""
+    """The path by wheels and gyro z, else by the wheels alone; None where nothing shows the heading."""
     wheels, imu = recording.wheels, recording.imu
     if wheels is None:
         return None

@@ -207,10 +207,10 @@ def _nees(run: Run) -> Iterator[Reason]:
 
 def _worse_than_a_baseline(run: Run) -> Iterator[Reason]:
     ours, row = run.scores.ate_m, _row(run, "position")
-    rivals = [("plain dead reckoning", run.baselines.dead_reckoning_m)]
+    alone = [("plain dead reckoning", run.baselines.dead_reckoning_m)]
     if run.scores.against == "truth":  # held-out fixes are the receiver itself
-        rivals.append(("the receiver alone", run.baselines.gnss_m))
-    for name, theirs in rivals:
+        alone.append(("the receiver alone", run.baselines.gnss_m))
+    for name, theirs in alone:
         if ours is None or theirs is None:
             continue
         promised = row is None or row.mean <= row.high
@@ -226,9 +226,9 @@ def _worse_than_a_baseline(run: Run) -> Iterator[Reason]:
 
 def _worse_in_outages(run: Run) -> Iterator[Reason]:
     ends = [
-        (outage.end_error_m, rival.dead_reckoning_m)
-        for outage, rival in zip(run.scores.outages, run.baselines.outages, strict=False)
-        if outage.end_error_m is not None and rival.dead_reckoning_m is not None
+        (outage.end_error_m, baseline.dead_reckoning_m)
+        for outage, baseline in zip(run.scores.outages, run.baselines.outages, strict=False)
+        if outage.end_error_m is not None and baseline.dead_reckoning_m is not None
     ]
     if len(ends) < LEAST_OUTAGES:
         return

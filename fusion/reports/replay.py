@@ -117,8 +117,9 @@ def write_report(
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
         overview=overview, runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
-        scores=rows, rivals=replay_text.shown_rivals(rows), tiles=replay_text.tiles(rows, names, pair[0]),
-        panels=sheet.panels, plots=sheet.json(), library=bokeh_script(), innovations=innovations,
+        scores=rows, baselines=replay_text.shown_baselines(rows),
+        tiles=replay_text.tiles(rows, names, pair[0]), panels=sheet.panels, plots=sheet.json(),
+        library=bokeh_script(), innovations=innovations,
         verdicts=replay_text.verdicts(names, metrics), assumed=_assumed(runs),
         reference=replay_text.REFERENCE[shown.scores.against or "truth"],
         label_strip=" The strip on top is the log's own label." if labelled else "",

@@ -12,7 +12,7 @@ from terrafusion.datasets.core.tables import number
 
 Metrics = Mapping[str, Any]
 
-RIVALS = {"dead_reckoning_m": "dead reckoning", "gnss_m": "receiver alone"}
+BASELINES = {"dead_reckoning_m": "dead reckoning", "gnss_m": "receiver alone"}
 """Baselines by their key in `metrics.json`."""
 TILES = (
     "Position error", "error at its end", "Consistency", "95 % within", "Estimated distance",
@@ -26,8 +26,8 @@ REFERENCE = {"truth": "the ground truth", "gnss_held_out": "held-out GNSS fixes"
 class ScoreRow:
     """One score of each run, None where it was not scored.
 
-    `goal` is "low" (less is better), "one" (nearer to 1 is better) or "" (neither is better). `rivals` are
-    the same score of the baselines of `RIVALS`.
+    `goal` is "low" (less is better), "one" (nearer to 1 is better) or "" (neither is better). `baselines` are
+    the same score of the baselines of `BASELINES`.
     """
 
     label: str
@@ -35,7 +35,7 @@ class ScoreRow:
     digits: int = 3
     goal: str = ""
     about: str = ""
-    rivals: tuple[float | None, ...] = (None, None)
+    baselines: tuple[float | None, ...] = (None, None)
 
     def best(self) -> int | None:
         """Which run is best, or None where fewer than two are scored or the best are equal as shown."""
@@ -69,9 +69,9 @@ class ScoreRow:
         """The number of run `i` as shown."""
         return number(self.values[i], self.digits)
 
-    def rival_text(self, k: int) -> str:
+    def baseline_text(self, k: int) -> str:
         """The number of a baseline as shown."""
-        return number(self.rivals[k], self.digits)
+        return number(self.baselines[k], self.digits)
 
     def _cost(self, value: float | None) -> float | None:
         if value is None or self.goal != "one":
@@ -94,8 +94,8 @@ def score_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
     reference = next((REFERENCE[r["against"]] for r in runs if r["against"]), "")
     ate = f"ATE: horizontal, against {reference}; aligned only at the start of a drive without GNSS"
     ates = tuple(run["ate_m"] for run in runs)
-    rivals = _rivals(runs[0].get("baselines"))
-    rows = [ScoreRow("Position error, RMS, m", ates, 3, "low", ate if reference else "", rivals)]
+    baselines = _baselines(runs[0].get("baselines"))
+    rows = [ScoreRow("Position error, RMS, m", ates, 3, "low", ate if reference else "", baselines)]
     for i, length in enumerate(runs[0]["rpe_percent"]):
         values = tuple(run["rpe_percent"].get(length) for run in runs)
         about = "RPE: mean over all segments of that length" if i == 0 else ""
@@ -130,13 +130,13 @@ def _outage_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
         ):
             values = tuple(run["outages"][i][key] if i < len(run["outages"]) else None for run in runs)
             ends = runs[0].get("baselines", {}).get("outages", ())[i : i + 1] if key == "end_error_m" else ()
-            rivals = _rivals(ends[0] if ends else None)
-            rows.append(ScoreRow(f"{_outage_name(outage)}: {what}", values, goal="low", rivals=rivals))
+            baselines = _baselines(ends[0] if ends else None)
+            rows.append(ScoreRow(f"{_outage_name(outage)}: {what}", values, goal="low", baselines=baselines))
     return rows
 
 
-def _rivals(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
-    return tuple(None if errors is None else errors.get(key) for key in RIVALS)
+def _baselines(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
+    return tuple(None if errors is None else errors.get(key) for key in BASELINES)
 
 
 @dataclass(frozen=True)
@@ -165,16 +165,18 @@ def tiles(rows: Sequence[ScoreRow], names: Sequence[str], ours: int) -> list[Til
 def _beside(row: ScoreRow, names: Sequence[str], ours: int) -> str:
     others = [f"{name} {row.text(i)}" for i, name in enumerate(names) if i != ours]
     others += [
-        f"{name} {row.rival_text(k)}" for k, name in enumerate(RIVALS.values()) if row.rivals[k] is not None
+        f"{name} {row.baseline_text(k)}"
+        for k, name in enumerate(BASELINES.values())
+        if row.baselines[k] is not None
     ]
     aim = ["1 is consistent"] if row.goal == "one" else []
     return "; ".join([*([names[ours]] if len(names) > 1 else []), *others, *aim])
 
 
-def shown_rivals(rows: Sequence[ScoreRow]) -> list[tuple[int, str]]:
+def shown_baselines(rows: Sequence[ScoreRow]) -> list[tuple[int, str]]:
     """The baselines that are scored in any row: number and name."""
-    names = enumerate(RIVALS.values())
-    return [(k, name) for k, name in names if any(row.rivals[k] is not None for row in rows)]
+    names = enumerate(BASELINES.values())
+    return [(k, name) for k, name in names if any(row.baselines[k] is not None for row in rows)]
 
 
 def verdicts(names: Sequence[str], runs: Sequence[Metrics]) -> list[dict[str, Any]]:

@@ -178,16 +178,16 @@ def _one_sensor(
     rig: Rig | None,
     decide: Callable[[str, list[BagTopic]], BagTopic] | None,
     kind: str,
-    rivals: list[BagTopic],
+    candidates: list[BagTopic],
 ) -> BagTopic:
     """The topic of a sensor among several of one type: the one with data, else that in the robot's frame.
 
     Raises:
         DataError: both are there; names them and the option to choose.
     """
-    keys = {topic.name: (topic.name, topic.msgtype) for topic in rivals}
+    keys = {topic.name: (topic.name, topic.msgtype) for topic in candidates}
     streams = read_streams(container, {key: wanted_fields(kind, key[1]) for key in keys.values()})
-    found = [topic for topic in rivals if _holds_data(streams[keys[topic.name]])]
+    found = [topic for topic in candidates if _holds_data(streams[keys[topic.name]])]
     if len(found) > 1 and kind == "imu" and rig is not None:
         frame = rig.sensors.imu.frame_id.lstrip("/")
         mounted = [topic for topic in found if _usual_frame(streams[keys[topic.name]]).lstrip("/") == frame]
@@ -196,12 +196,12 @@ def _one_sensor(
         return found[0]
     if decide is not None and found:
         return decide(kind, found)
-    listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in rivals)
+    listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in candidates)
     raise DataError(
-        f"{len(rivals)} sensors of one kind: {listed}",
+        f"{len(candidates)} sensors of one kind: {listed}",
         file=path,
         channel=kind,
-        remedy=f"choose with --topic {kind}={rivals[0].name} (or topics={{'{kind}': ...}} in Python)",
+        remedy=f"choose with --topic {kind}={candidates[0].name} (or topics={{'{kind}': ...}} in Python)",
     )
 
 

@@ -33,7 +33,7 @@ class BagContents:
 
     topics: tuple[TopicContents, ...]
     unused: tuple[str, ...]
-    rivals: dict[str, tuple[str, ...]]
+    candidates: dict[str, tuple[str, ...]]
 
 
 def _fields_of(topic: BagTopic) -> tuple[str, ...]:
@@ -57,10 +57,10 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
     form = format_of(path).name
     if form not in ("ros1", "ros2"):
         return None
-    rivals: dict[str, tuple[str, ...]] = {}
+    candidates: dict[str, tuple[str, ...]] = {}
 
     def open_to_the_user(kind: str, found: list[BagTopic]) -> BagTopic:
-        rivals[kind] = tuple(topic.name for topic in found)
+        candidates[kind] = tuple(topic.name for topic in found)
         return found[0]
 
     doors = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
@@ -76,4 +76,4 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         if len(t_ns):  # the index of a bag may count messages that are not there
             contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in there if topic not in usable)
-    return BagContents(tuple(contents), unused, rivals)
+    return BagContents(tuple(contents), unused, candidates)

@@ -92,7 +92,7 @@ def choose_topics(
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
     is_steering_joints: Callable[[str], bool] = lambda topic: False,
-    one_of: Callable[[str, list[BagTopic]], BagTopic] = lambda kind, rivals: rivals[0],
+    one_of: Callable[[str, list[BagTopic]], BagTopic] = lambda kind, candidates: candidates[0],
 ) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes on what was taken and left.
 
@@ -127,8 +127,8 @@ def choose_topics(
         ]
         fits.sort(key=functools.partial(_rank, kind))
         if kind not in chosen and fits:
-            rivals = [t for t in fits if t.msgtype == fits[0].msgtype]
-            chosen[kind] = one_of(kind, rivals) if kind in SENSORS and len(rivals) > 1 else fits[0]
+            candidates = [t for t in fits if t.msgtype == fits[0].msgtype]
+            chosen[kind] = one_of(kind, candidates) if kind in SENSORS and len(candidates) > 1 else fits[0]
         left = [f"{t.name} ({t.count})" for t in fits if t.name != chosen[kind].name]
         if left:
             taken_one = chosen[kind]

@@ -122,9 +122,9 @@ def _family(given: RecordingFile) -> tuple[str, list[RecordingFile]]:
     name = _robot_name(given.stem)
     if given.kind in ("center", "front"):
         name = max((r for r in robots if _belongs(given.stem, r)), key=len, default=given.stem)
-    kin = [p for p in found if _owner(p, robots) == name]
-    kinds = dict.fromkeys([given.kind, *(p.kind for p in kin)])
-    return name, [_choice(given, kind, [p for p in kin if p.kind == kind]) for kind in kinds]
+    own = [p for p in found if _owner(p, robots) == name]
+    kinds = dict.fromkeys([given.kind, *(p.kind for p in own)])
+    return name, [_choice(given, kind, [p for p in own if p.kind == kind]) for kind in kinds]
 
 
 def _belongs(stem: str, robot: str) -> bool:
