@@ -5,12 +5,13 @@ Refused are what would hang a reader or hide a mistake: double keys, merge keys 
 nesting, and aliases that stand for very many values.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import write_atomically
 
 _TAG = "tag:yaml.org,2002:"
 
@@ -55,6 +56,20 @@ def _loaded(text: str, path: Path) -> Any:
         mark = getattr(error, "problem_mark", None)
         line = f" at line {mark.line + 1}" if mark is not None else ""
         raise ConfigError(f"not valid YAML{line}: {problem}", file=path, remedy="mend that line") from None
+
+
+def dump_yaml(path: Path, content: Mapping[str, Any], **settings: Any) -> Path:
+    """Write a mapping in the order of its keys; `settings` are attributes of ruamel's `YAML`.
+
+    Raises:
+        TerrafusionError: the file cannot be written.
+    """
+    from ruamel.yaml import YAML
+
+    yaml: Any = YAML()
+    for name, value in settings.items():
+        setattr(yaml, name, value)
+    return write_atomically(path, lambda part: yaml.dump(content, part))
 
 
 class _Builder:

@@ -133,7 +133,7 @@ def _write_table(path: Path, start_ns: int, table: OutputTable) -> None:
         for first in range(0, len(table.t_ns), BLOCK_ROWS):
             rows = slice(first, first + BLOCK_ROWS)
             since_start = table.t_ns[rows] - np.int64(start_ns)
-            cells = [_seconds(since_start), *(_cells(c[rows]) for c in table.columns.values())]
+            cells = [decimal_seconds(since_start), *(_cells(c[rows]) for c in table.columns.values())]
             out.write("\n".join(map(",".join, zip(*cells, strict=True))) + "\n")
 
 
@@ -152,7 +152,7 @@ def _special(text: str) -> bool:
     return any(mark in text for mark in ',"\r\n')
 
 
-def _seconds(t_ns: NDArray[np.int64]) -> list[str]:
+def decimal_seconds(t_ns: NDArray[np.int64]) -> list[str]:
     """Nanoseconds as decimal seconds with 9 decimals, exactly."""
     whole, rest = np.divmod(np.abs(t_ns), 10**9)
     signs = np.where(t_ns < 0, "-", "").tolist()

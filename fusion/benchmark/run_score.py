@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.benchmark.field_logs import UNFORESEEN
 from terrafusion.fusion.benchmark.methods import Method, replay_options
 from terrafusion.fusion.benchmark.twin_runs import BenchmarkRun
+from terrafusion.fusion.metrics.baselines import rms
 from terrafusion.fusion.metrics.consistency import estimated_ground_at, position, summarise
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.health import examine_estimate
@@ -125,7 +125,7 @@ def _with_errors(score: RunScore, run: BenchmarkRun, result: ReplayResult) -> Ru
             nees=outage.nees_mean,
             heading_rad=outage.end_yaw_error_rad,
         )
-    score = dataclasses.replace(score, error_m=_rms(distance[inside]))
+    score = dataclasses.replace(score, error_m=rms(distance[inside]))
     if run.labels is None:
         return score
     # Labels, not the terrain channel: they include the terrain name of a whole log.
@@ -166,9 +166,9 @@ def _by_ground(
             GroundScore(
                 ground=ground,
                 seconds=step_s * float(lost.sum()),
-                forward_mps=_rms(errors.velocity_error_mps[lost, 0]),
-                side_mps=_rms(errors.velocity_error_mps[lost, 1]),
-                heading_mps=_rms((speed * errors.yaw_error_rad())[lost]),
+                forward_mps=rms(errors.velocity_error_mps[lost, 0]),
+                side_mps=rms(errors.velocity_error_mps[lost, 1]),
+                heading_mps=rms((speed * errors.yaw_error_rad())[lost]),
                 recognised=float(right[lost].mean()) if lost.any() else None,
                 nees=whole.mean if whole else None,
                 effective=whole.effective if whole else None,
@@ -177,8 +177,3 @@ def _by_ground(
             )
         )
     return rows
-
-
-def _rms(values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else None

@@ -10,9 +10,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.quantity import Quantity, Word
-from terrafusion.datasets.core.yaml_file import read_yaml
+from terrafusion.datasets.core.yaml_file import dump_yaml, read_yaml
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Ground, Tally
 from terrafusion.fusion.grounds.memory import MOST_GROUNDS, GroundMemory
 from terrafusion.fusion.grounds.signature import SIGNATURE
@@ -88,17 +87,8 @@ def read_grounds(path: Path) -> GroundMemory:
 
 def save_grounds(memory: GroundMemory, path: Path) -> None:
     """Write a memory: same memory, same bytes."""
-    from ruamel.yaml import YAML
-
-    yaml = YAML()
-    yaml.default_flow_style = None
     content = {"schema": SCHEMA, "robot": memory.robot, "grounds": [_written(g) for g in memory.grounds]}
-
-    def write(temporary: Path) -> None:
-        with temporary.open("w", encoding="utf-8") as out:
-            yaml.dump(content, out)
-
-    write_atomically(path, write)
+    dump_yaml(path, content, default_flow_style=None)
 
 
 def _ground(content: GroundFile) -> Ground:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss, Wheels
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -113,9 +114,9 @@ def baselines(
             if path is not None and not aligned:
                 ends[0] = _outage_end_m(path, known, errors, rows, begin_ns, lever if against_antenna else 0j)
             if receiver is not None:
-                ends[1] = _number(receiver[rows[-1]])
+                ends[1] = finite(receiver[rows[-1]])
         found.append(OutageBaseline(outage.start_s, *ends))
-    return Baselines(_rms(reckoned), _rms(receiver), tuple(found), reckoned, receiver)
+    return Baselines(rms(reckoned), rms(receiver), tuple(found), reckoned, receiver)
 
 
 def dead_reckoning(recording: Recording, wheel_radius_m: float, track_m: float) -> ReckonedPath | None:
@@ -183,7 +184,7 @@ def _outage_end_m(
     turn = keys.yaw_rad()[k] - yaw0
     place = complex(*keys.position_m[k, :2]) + np.exp(1j * turn) * (z1 - z0)
     place += point * np.exp(1j * (yaw1 + turn))
-    return _number(abs(place - complex(*errors.reference_m[rows[-1]])))
+    return finite(float(abs(place - complex(*errors.reference_m[rows[-1]]))))
 
 
 def _receiver_error_m(fixes: Gnss, errors: Errors, lever: complex) -> Array:
@@ -216,10 +217,7 @@ def _columns(place: Complex) -> Array:
     return np.stack([place.real, place.imag], axis=1)
 
 
-def _rms(values: Array | None) -> float | None:
-    finite = np.zeros(0) if values is None else values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite**2))) if len(finite) else None
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def rms(values: Array | None) -> float | None:
+    """Root mean square of the finite values; None where there are none."""
+    known = np.zeros(0) if values is None else values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else None

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.writers.log_folder import decimal_seconds
 from terrafusion.datasets.writers.tum import write_tum
 from terrafusion.fusion.config.assumptions import Assumption
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
@@ -222,7 +223,7 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     P = path.covariance if path.covariance is not None else np.full((n, 6, 6), np.nan)
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
     offset = path.t_ns - start_ns
-    table = {"t_s": [_seconds(t) for t in offset.tolist()], "t_ns": [str(t) for t in path.t_ns.tolist()]}
+    table = {"t_s": decimal_seconds(offset), "t_ns": [str(t) for t in path.t_ns.tolist()]}
     table |= _numbers(("x_m", "y_m", "z_m"), path.position_m, ".6f")
     table |= _numbers(("qx", "qy", "qz", "qw"), q, ".9f")
     table |= _numbers(("v_e_mps", "v_n_mps", "v_u_mps"), estimate.velocity_mps, ".6f")
@@ -261,11 +262,6 @@ def _numbers(names: Sequence[str], values: NDArray[Any], spec: str) -> dict[str,
         name: [format(x, spec) if math.isfinite(x) else "" for x in column]
         for name, column in zip(names, columns, strict=True)
     }
-
-
-def _seconds(t_ns: int) -> str:
-    whole, rest = divmod(abs(t_ns), 10**9)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
 
 
 def _one_line(value: object) -> str:

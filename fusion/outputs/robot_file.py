@@ -7,8 +7,9 @@ from typing import Any
 
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.files import expanded, write_atomically
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.robot import KnownNumber, RobotFile
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.sensor_calibration import SensorCalibration
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import vehicle_names
@@ -72,19 +73,11 @@ def _entry(number: KnownNumber) -> dict[str, Any]:
 
 
 def _write(path: Path, robot: dict[str, Any]) -> Path:
-    from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
 
-    yaml: Any = YAML()
-    yaml.width = 1000
     section = CommentedMap(robot)
     for name, entry in robot.items():
         if isinstance(entry, dict):  # a number a line
             section[name] = CommentedMap(entry)
             section[name].fa.set_flow_style()
-
-    def dump(part: Path) -> None:
-        with part.open("w", encoding="utf-8") as file:
-            yaml.dump({"robot": section}, file)
-
-    return write_atomically(path, dump)
+    return dump_yaml(path, {"robot": section}, width=1000)

@@ -15,7 +15,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.noise.policy import SCHEMA, Policy, SensorNoise, within_ranges
 from terrafusion.fusion.training.ground_samples import (
     ACCEL_S,
@@ -230,8 +230,6 @@ def fingerprint_of(grid: Grid, logged: LoggedSamples = LoggedSamples()) -> str:
 
 def write_policy(policy: Policy, path: Path, made_by: str) -> None:
     """Write a policy file, byte for byte repeatable."""
-    from ruamel.yaml import YAML
-
     content = {
         "schema": SCHEMA,
         "made_by": made_by,
@@ -239,6 +237,4 @@ def write_policy(policy: Policy, path: Path, made_by: str) -> None:
         "classes": {name: dataclasses.asdict(row) for name, row in policy.classes.items()},
         "fixed": dataclasses.asdict(policy.fixed),
     }
-    yaml = YAML()
-    yaml.default_flow_style = False
-    write_atomically(path, lambda part: yaml.dump(content, part))
+    dump_yaml(path, content, default_flow_style=False)

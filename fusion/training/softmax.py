@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.datasets.core.files import write_atomically
-from terrafusion.datasets.core.yaml_file import read_yaml
+from terrafusion.datasets.core.yaml_file import dump_yaml, read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.training.surface_features import (
     GROUPS,
@@ -138,18 +137,13 @@ class SoftmaxModel:
 
     def write(self, path: Path) -> None:
         """Write as YAML, six significant digits."""
-        from ruamel.yaml import YAML
-
         content: dict[str, Any] = {
             "schema": SCHEMA, "made_by": self.made_by, "inputs": self.inputs,
             "features": list(SURFACE_FEATURES), "classes": list(self.classes),
             "temperature": _digits(self.temperature), "odd_distance": _digits(self.odd_distance),
         }  # fmt: skip
         content |= {name: _digits(getattr(self, name).tolist()) for name in _NUMBERS}
-        yaml = YAML()
-        yaml.default_flow_style = None
-        yaml.width = 110
-        write_atomically(path, lambda part: yaml.dump(content, part))
+        dump_yaml(path, content, default_flow_style=None, width=110)
 
 
 def read_softmax(path: Path) -> SoftmaxModel:

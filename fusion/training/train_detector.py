@@ -14,7 +14,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
 from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter
@@ -237,8 +237,6 @@ def _plain(scores: DetectorScores) -> dict[str, Any]:
 
 def write_model(model: TerrainModel, path: Path) -> None:
     """Write the model as YAML, six significant digits, byte for byte repeatable."""
-    from ruamel.yaml import YAML
-
     content = {
         "schema": SCHEMA,
         "made_by": model.made_by,
@@ -251,10 +249,7 @@ def write_model(model: TerrainModel, path: Path) -> None:
         "unknown": _listed(model.unknown),
         "scores": model.scores,
     }
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 110
-    write_atomically(path, lambda part: yaml.dump(content, part))
+    dump_yaml(path, content, default_flow_style=None, width=110)
 
 
 def _listed(mixture: Mixture) -> list[dict[str, Any]]:

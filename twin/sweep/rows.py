@@ -3,7 +3,6 @@ lanes.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -12,6 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.engine.integrate import raise_if_diverged
@@ -149,7 +149,7 @@ def _row(sweep: Sweep, case: SweepPoint, outcome: Row | Exception) -> Row:
         row |= {"status": FAILED, "error": str(outcome) if known else f"{type(outcome).__name__}: {outcome}"}
     else:
         row |= outcome
-    return {column.name: _plain(row.get(column.name)) for column in columns(sweep.sensors)}
+    return {column.name: finite(row.get(column.name)) for column in columns(sweep.sensors)}
 
 
 def _axes(sweep: Sweep, case: SweepPoint) -> Row:
@@ -205,11 +205,6 @@ def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
 
     errors = speed_errors(profiles_of(recording, vehicle.odometry.wheel_radius_m))
     return {"odometry_error_pct": errors.odometry, "imu_error_pct": errors.imu, "gnss_error_pct": errors.gnss}
-
-
-def _plain(value: Any) -> Any:
-    """None for a number that is not finite: the table has no NaN."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:

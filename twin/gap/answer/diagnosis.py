@@ -1,9 +1,9 @@
 """`GapDiagnosis`: the result of a diagnosis, and its form in `diagnosis.json`."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.twin.gap.answer.next_run import NextRun
 from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
@@ -81,7 +81,7 @@ class GapDiagnosis:
             "seconds": round(self.seconds, 3),
             "gap": {
                 "detected": self.detected,
-                "statistic": _number(self.detection.statistic) or 0.0,
+                "statistic": finite(self.detection.statistic) or 0.0,
                 "p_value": float(self.detection.p_value),
                 "significance": self.significance,
                 "uncalibrated": self.uncalibrated,
@@ -113,17 +113,13 @@ class GapDiagnosis:
         }
 
 
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
 def _cause(evidence: GapEvidence, cause: Cause) -> dict[str, Any]:
     c, parameters = evidence.candidates, {}
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
         base, shift = evidence.model.effects.get(c.keys[i], 0.0), float(value * c.scale[i])
         parameters[c.keys[i]] = {
             "value": min(max(base + shift, float(c.low[i])), float(c.high[i])) - base,
-            "sigma": _number(float(sigma * c.scale[i])),
+            "sigma": finite(float(sigma * c.scale[i])),
             "unit": c.units[i],
         }
     return {
@@ -131,7 +127,7 @@ def _cause(evidence: GapEvidence, cause: Cause) -> dict[str, Any]:
         "class": list(cause.members),
         "probability": min(max(cause.probability, 0.0), 1.0),
         "parameters": parameters,
-        "explained_share": _number(cause.share),
+        "explained_share": finite(cause.share),
     }
 
 
@@ -140,12 +136,12 @@ def _shrink(s: Shrinkage) -> dict[str, Any]:
         "metric": METRIC,
         "before": s.before,
         "after": s.after,
-        "floor": _number(s.floor),
-        "share": _number(s.share),
+        "floor": finite(s.floor),
+        "share": finite(s.share),
         "ci": None if s.interval is None else [float(x) for x in s.interval],
-        "recalibration_only": _number(s.recalibrated),
+        "recalibration_only": finite(s.recalibrated),
         "per_channel": {
-            name: {"before": _number(b), "after": _number(a), "floor": _number(f)}
+            name: {"before": finite(b), "after": finite(a), "floor": finite(f)}
             for name, (b, a, f) in s.channels.items()
         },
     }
