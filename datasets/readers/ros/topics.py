@@ -3,7 +3,7 @@
 import difflib
 import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -129,20 +129,24 @@ def choose_topics(
         if kind not in chosen and fits:
             candidates = [t for t in fits if t.msgtype == fits[0].msgtype]
             chosen[kind] = one_of(kind, candidates) if kind in SENSORS and len(candidates) > 1 else fits[0]
-        left = [f"{t.name} ({t.count})" for t in fits if t.name != chosen[kind].name]
-        if left:
-            taken_one = chosen[kind]
-            notes.append(
-                f"{kind}: took {taken_one.name} ({taken_one.count} messages), left {', '.join(left)}"
-            )
-        elif kind not in chosen and kind in ("wheels", "gnss"):
-            fused = [t.name for t in found if _is_fused(kind, t)]
-            if fused:
-                notes.append(
-                    f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "
-                    f"ask for it with topic {kind}={fused[0]}"
-                )
+        notes += _choice_notes(kind, chosen.get(kind), fits, found)
     return chosen, notes
+
+
+def _choice_notes(
+    kind: str, taken: BagTopic | None, fits: list[BagTopic], found: list[BagTopic]
+) -> Iterator[str]:
+    """What was left beside the topic taken; without one, the fused estimates that were not."""
+    left = [f"{t.name} ({t.count})" for t in fits if taken is not None and t.name != taken.name]
+    if taken is not None and left:
+        yield f"{kind}: took {taken.name} ({taken.count} messages), left {', '.join(left)}"
+    elif taken is None and kind in ("wheels", "gnss"):
+        fused = [t.name for t in found if _is_fused(kind, t)]
+        if fused:
+            yield (
+                f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "
+                f"ask for it with topic {kind}={fused[0]}"
+            )
 
 
 def joints_given(user: Mapping[str, str] | None) -> dict[str, str]:
