@@ -1,7 +1,5 @@
 """A robot's sensor numbers from its logs: each is replayed as live, from what the ones before it gave."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -218,7 +216,7 @@ class _Learner:
     def mounting(self) -> ImuMounting:
         return self.estimator.learned.mounting
 
-    def run(self, earlier: _Learner | None, progress: Callable[[float], None] | None) -> None:
+    def run(self, earlier: "_Learner | None", progress: Callable[[float], None] | None) -> None:
         """Learn from the log, beginning with what the learner of an earlier one knows."""
         if earlier is not None:
             known = for_the_next_run(earlier.known, self.calibration.prior, self.yaw)

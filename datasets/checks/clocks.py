@@ -1,7 +1,5 @@
 """Clocks that jump ahead or drift, detected by comparison with other sensors."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator
@@ -50,7 +48,7 @@ class Drift:
         since = (t_ns - self.anchor_ns) * self.scale + self.offset_s * 1e9
         return np.asarray(self.anchor_ns + np.rint(since).astype(np.int64))
 
-    def reversed(self) -> Drift:
+    def reversed(self) -> "Drift":
         """The drift of the other clock of the pair, were this one right."""
         return Drift(self.anchor_ns, -self.offset_s / self.scale, 1.0 / self.scale, self.spread, self.r)
 

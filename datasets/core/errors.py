@@ -1,10 +1,9 @@
 """Errors that a user of terrafusion may see."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 from terrafusion.datasets.core.printable import printable
 
@@ -58,7 +57,7 @@ class ConfigError(TerrafusionError):
     """A parameter file with an unknown key, a wrong unit or a value out of range."""
 
     @classmethod
-    def joined(cls, errors: Sequence[ConfigError]) -> ConfigError:
+    def joined(cls, errors: "Sequence[ConfigError]") -> Self:
         """One error of several (at least one), a line each."""
         first = errors[0]
         error = cls(first.what, file=first.file, channel=first.channel, remedy=first.remedy)

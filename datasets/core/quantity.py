@@ -8,8 +8,6 @@ The unit is the suffix of the key, so that a number cannot be read without it. `
 beside a sourced value: the range its source covers.
 """
 
-from __future__ import annotations
-
 import math
 import reprlib
 from abc import ABC, abstractmethod
@@ -41,7 +39,7 @@ class RejectedError(ValueError):
         super().__init__(what)
         self.what, self.remedy = what, remedy
 
-    def inside(self, suffix: str) -> RejectedError:
+    def inside(self, suffix: str) -> "RejectedError":
         """The same about a part of the value, `{key}` and `suffix`."""
         return RejectedError(self.what.replace("{key}", f"{{key}}{suffix}"), self.remedy)
 

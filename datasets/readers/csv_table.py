@@ -1,7 +1,5 @@
 """One channel's CSV of a log folder: strict header, times exact to the nanosecond."""
 
-from __future__ import annotations
-
 import csv
 import difflib
 from collections.abc import Iterable, Sequence
@@ -43,7 +41,7 @@ class CsvTable:
         missing = np.full(len(self.t_ns), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def select(self, rows: NDArray[Any]) -> CsvTable:
+    def select(self, rows: NDArray[Any]) -> "CsvTable":
         """The rows of a boolean mask or index array."""
         return CsvTable(
             self.t_ns[rows],

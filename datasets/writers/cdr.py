@@ -4,11 +4,9 @@ All messages of a topic whose texts and array lengths stay the same have the sam
 that vary stand at fixed places, so that a block of messages is one structured array.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,27 +28,27 @@ class CdrTemplate:
     def _align(self, size: int) -> None:
         self._bytes.extend(bytes(-(len(self._bytes) - 4) % size))
 
-    def constant(self, code: str, *values: float) -> CdrTemplate:
+    def constant(self, code: str, *values: float) -> Self:
         """Numbers that are the same in all messages; `code` as in `struct`."""
         self._align(struct.calcsize(code))
         self._bytes.extend(struct.pack(f"<{len(values)}{code}", *values))
         return self
 
-    def string(self, text: str) -> CdrTemplate:
+    def string(self, text: str) -> Self:
         """A text that is the same in all messages."""
         data = text.encode() + b"\0"
         self.constant("I", len(data))
         self._bytes.extend(data)
         return self
 
-    def strings(self, texts: Sequence[str]) -> CdrTemplate:
+    def strings(self, texts: Sequence[str]) -> Self:
         """A sequence of such texts."""
         self.constant("I", len(texts))
         for text in texts:
             self.string(text)
         return self
 
-    def field(self, name: str, dtype: str = "<f8", count: int = 1) -> CdrTemplate:
+    def field(self, name: str, dtype: str = "<f8", count: int = 1) -> Self:
         """`count` numbers that vary, found under `name` in the rows."""
         kind = np.dtype(dtype)
         self._align(kind.itemsize)
@@ -58,12 +56,12 @@ class CdrTemplate:
         self._bytes.extend(bytes(kind.itemsize * count))
         return self
 
-    def sequence(self, name: str, count: int) -> CdrTemplate:
+    def sequence(self, name: str, count: int) -> Self:
         """A sequence of `count` doubles that vary."""
         self.constant("I", count)
         return self.field(name, count=count) if count else self
 
-    def header(self, frame_id: str) -> CdrTemplate:
+    def header(self, frame_id: str) -> Self:
         """std_msgs/Header; see `stamp`."""
         return self.field("sec", "<i4").field("nanosec", "<u4").string(frame_id)
 

@@ -6,8 +6,6 @@ heading is the gyro's, rotated once a chunk to the yaw of the poses: over two se
 lidar's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +43,7 @@ class Poses:
     yaw_rad: Array
     chunk: NDArray[np.int64]
 
-    def select(self, rows: NDArray[np.bool_]) -> Poses:
+    def select(self, rows: NDArray[np.bool_]) -> "Poses":
         """The poses of a mask (M,)."""
         return Poses(self.t_s[rows], self.xy_m[rows], self.yaw_rad[rows], self.chunk[rows])
 

@@ -1,12 +1,10 @@
 """Runs the jobs of a benchmark in parallel; an interrupted benchmark continues from its `checkpoints`."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder
@@ -27,7 +25,7 @@ class BenchmarkResult:
     refused: tuple[Refusal, ...]
 
     @classmethod
-    def read(cls, raw: dict[str, Any]) -> BenchmarkResult:
+    def read(cls, raw: dict[str, Any]) -> Self:
         """A result from its JSON object."""
         return cls(tuple(map(RunScore.read, raw["rows"])), tuple(Refusal(**one) for one in raw["refused"]))
 

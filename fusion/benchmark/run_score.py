@@ -1,11 +1,9 @@
 """Score of one replay: its errors, and on each ground their components."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +83,7 @@ class RunScore:
     grounds: tuple[GroundScore, ...] = ()
 
     @classmethod
-    def read(cls, raw: dict[str, Any]) -> RunScore:
+    def read(cls, raw: dict[str, Any]) -> Self:
         """A score from its JSON object."""
         return cls(**{**raw, "grounds": tuple(GroundScore(**ground) for ground in raw["grounds"])})
 

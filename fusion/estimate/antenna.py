@@ -1,7 +1,5 @@
 """Where the antenna was taken to be over a drive in which the estimator learned it; lateness of its fixes."""
 
-from __future__ import annotations
-
 import bisect
 from dataclasses import dataclass
 
@@ -22,11 +20,11 @@ class AntennaPlaces:
     late_ns: tuple[int, ...] = (0,)
 
     @classmethod
-    def fixed(cls, lever_m: tuple[float, ...]) -> AntennaPlaces:
+    def fixed(cls, lever_m: tuple[float, ...]) -> "AntennaPlaces":
         """One place for the whole drive."""
         return cls((0,), (lever_m,))
 
-    def then(self, t_ns: int, lever_m: tuple[float, ...], late_ns: int = 0) -> AntennaPlaces:
+    def then(self, t_ns: int, lever_m: tuple[float, ...], late_ns: int = 0) -> "AntennaPlaces":
         """The same with another place and lateness from `t_ns` on."""
         if lever_m == self.lever_m[-1] and late_ns == self.late_ns[-1]:
             return self

@@ -11,8 +11,6 @@ Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world (m
 velocity and bias are GTSAM variables; the linear states live in the chain alone.
 """
 
-from __future__ import annotations
-
 import bisect
 import functools
 from collections.abc import Sequence
@@ -58,7 +56,7 @@ class Chain:
     velocity and the linear states enter the factors (nearly) linearly and never require it.
     """
 
-    def __init__(self, archive: Chain | None = None, calibrate: bool = False) -> None:
+    def __init__(self, archive: "Chain | None" = None, calibrate: bool = False) -> None:
         self.archive = archive
         self.dim = dim_of(calibrate)
         self.first = 0

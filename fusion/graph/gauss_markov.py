@@ -1,7 +1,5 @@
 """Gauss-Markov steps of the linear states; see `datasets.core.gauss_markov`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +21,14 @@ class MarkovStep:
         """Noise (n,) that leads from `before` to `now`, unwhitened."""
         return np.asarray(now - self.mean - self.decay * (before - self.mean))
 
-    def restarted(self, states: slice) -> MarkovStep:
+    def restarted(self, states: slice) -> "MarkovStep":
         """The step with `states` restarted: from their mean, with their stationary spread."""
         decay, sigma = self.decay.copy(), self.sigma.copy()
         sigma[states] /= np.sqrt(1.0 - decay[states] ** 2)
         decay[states] = 0.0
         return MarkovStep(decay, self.mean, sigma)
 
-    def inflated(self, other: MarkovStep, states: Array) -> MarkovStep:
+    def inflated(self, other: "MarkovStep", states: Array) -> "MarkovStep":
         """The step with `states` (indices) as in `other` where that forgets more of them."""
         taken = states[other.decay[states] < self.decay[states]]
         decay, mean, sigma = self.decay.copy(), self.mean.copy(), self.sigma.copy()

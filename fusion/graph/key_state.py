@@ -1,7 +1,5 @@
 """The state of one keyframe and its tangent space."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 
@@ -98,7 +96,7 @@ class KeyState:
         """Drift of the GNSS position (2,), m."""
         return self.of(DRIFT)
 
-    def retract(self, delta: Array) -> KeyState:
+    def retract(self, delta: Array) -> "KeyState":
         """The state moved by a tangent vector (DIM,) or (DIM - len(ON_DEMAND),)."""
         linear = self.linear.copy()
         linear[: len(delta) - NAV.stop] += delta[NAV.stop :]
@@ -112,7 +110,7 @@ class KeyState:
             linear,
         )
 
-    def local(self, other: KeyState) -> Array:
+    def local(self, other: "KeyState") -> Array:
         """The tangent vector (DIM,) that leads from this state to `other`."""
         return np.concatenate(
             [

@@ -16,11 +16,9 @@ rotation: Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J.
 Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -71,11 +69,11 @@ class WheelIncrement:
     surge_m: float = 0.0
     skid_m: float = 0.0
 
-    def without_turn(self) -> WheelIncrement:
+    def without_turn(self) -> Self:
         """The increment without a measurement of the turn."""
         return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
-    def doubted(self, variance_m2: float, times: float) -> WheelIncrement:
+    def doubted(self, variance_m2: float, times: float) -> Self:
         """The increment with distance and turn so uncertain that the variance `variance_m2` of the innovation
         along body x grows by the factor `times`; the non-holonomic constraint stays.
         """
@@ -84,7 +82,7 @@ class WheelIncrement:
         sigma = self.sigma * np.array([scale, 1.0, 1.0, scale])
         return dataclasses.replace(self, sigma=sigma, speed_change_mps=change)
 
-    def with_extra_variance(self, variance_m2: float) -> WheelIncrement:
+    def with_extra_variance(self, variance_m2: float) -> Self:
         """The increment with `variance_m2` added along body x and y each."""
         sigma = self.sigma.copy()
         sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance_m2)

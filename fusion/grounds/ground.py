@@ -1,7 +1,5 @@
 """One ground as one robot knows it: its signature, and what it does to wheels, heading and path."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 
@@ -40,11 +38,11 @@ class Tally:
     square: Array
 
     @classmethod
-    def empty(cls, size: int) -> Tally:
+    def empty(cls, size: int) -> "Tally":
         """Of `size` numbers, none seen yet."""
         return cls(np.zeros(size), np.zeros(size), np.zeros(size))
 
-    def plus(self, values: Array, weight: float = 1.0, noise: float = 0.0) -> Tally:
+    def plus(self, values: Array, weight: float = 1.0, noise: float = 0.0) -> "Tally":
         """With one more entry (d,); NaN is skipped. `noise` is the variance of its measurement."""
         seen = np.isfinite(values)
         count = np.minimum(self.count, MOST_WINDOWS) + weight * seen
@@ -53,7 +51,7 @@ class Tally:
         square = (1.0 - gain) * (self.square + gain * off**2) - gain * noise
         return Tally(count, self.mean + gain * off, np.where(seen, square, self.square))
 
-    def merged(self, other: Tally) -> Tally:
+    def merged(self, other: "Tally") -> "Tally":
         """Of both together."""
         count = self.count + other.count
         share = np.where(count > 0.0, other.count / np.maximum(count, 1e-12), 0.0)
@@ -84,7 +82,7 @@ class Ground:
     last: str = ""
 
     @classmethod
-    def new(cls, name: str) -> Ground:
+    def new(cls, name: str) -> "Ground":
         """Nothing is known of it."""
         even = np.full(FRICTION_MODELS, 1.0 / FRICTION_MODELS)
         return cls(name, Tally.empty(len(SIGNATURE)), Tally.empty(2), even)
@@ -114,20 +112,20 @@ class Ground:
         variance = self.variance() * (wider + 1.0 / np.maximum(n, 1.0))
         return student_t(signature, self.signature.mean, variance, n > 0.0)
 
-    def seen(self, signature: Array, weight: float, date: str) -> Ground:
+    def seen(self, signature: Array, weight: float, date: str) -> "Ground":
         """With one more window."""
         first = self.first or date
         return dataclasses.replace(
             self, signature=self.signature.plus(signature, weight), first=first, last=date or self.last
         )
 
-    def with_friction(self, friction: Array, weight: float) -> Ground:
+    def with_friction(self, friction: Array, weight: float) -> "Ground":
         """With friction probabilities (10,) of one more window."""
         n = min(self.friction_windows, MOST_WINDOWS) + weight
         mean = self.friction + weight / n * (friction - self.friction)
         return dataclasses.replace(self, friction=mean, friction_windows=n)
 
-    def merged(self, other: Ground) -> Ground:
+    def merged(self, other: "Ground") -> "Ground":
         """This ground with what `other` knows of the same one."""
         windows = self.friction_windows + other.friction_windows
         share = other.friction_windows / windows if windows else 0.0

@@ -7,8 +7,6 @@ no ground explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and 
 that came to look alike are merged.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -66,7 +64,7 @@ class GroundMemory:
     def belief(self, probabilities: Array) -> None:
         self._belief = probabilities.tolist()
 
-    def copy(self) -> GroundMemory:
+    def copy(self) -> "GroundMemory":
         """The same grounds, at the begin of a drive."""
         return GroundMemory(self.grounds, self.robot)
 
@@ -141,7 +139,7 @@ class GroundMemory:
         belief[0] = NEW_SHARE * belief[-1]
         self.belief = belief / belief.sum()
 
-    def named(self, names: dict[str, str]) -> GroundMemory:
+    def named(self, names: dict[str, str]) -> "GroundMemory":
         """With grounds renamed: old name -> new name; two of one name become one ground."""
         found: dict[str, Ground] = {}
         for ground in self.grounds:
@@ -150,7 +148,7 @@ class GroundMemory:
             found[name] = found[name].merged(other) if name in found else other
         return GroundMemory(list(found.values()), self.robot)
 
-    def condensed(self) -> GroundMemory:
+    def condensed(self) -> "GroundMemory":
         """With grounds merged that look alike, and those left out of which too little was seen."""
         kept: list[Ground] = []
         for ground in sorted(self.grounds, key=lambda g: -g.windows):

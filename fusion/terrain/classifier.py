@@ -8,14 +8,12 @@ temperature calibrated on runs held out from training (Guo et al. 2017), as neig
 another.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 
@@ -77,7 +75,7 @@ class TerrainModel:
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
     slip_only: bool = False
 
-    def for_vehicle(self, name: str | None) -> TerrainModel:
+    def for_vehicle(self, name: str | None) -> Self:
         """The model for a robot.
 
         Vibration and skidding in turns depend more on tyres, chassis and IMU mounting than on the ground.

@@ -7,8 +7,6 @@ seconds, as logarithms, so that speed, load and sensor gain are shifts. Missing 
 and absolute heading, which would identify the place or day, are left out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +63,7 @@ class Signals:
     current_s: Array
     current_a: Array
 
-    def between(self, begin_s: float, end_s: float) -> Signals:
+    def between(self, begin_s: float, end_s: float) -> "Signals":
         """The samples in (begin, end]."""
 
         def cut(t: Array) -> slice:
@@ -127,7 +125,7 @@ class SurfaceWindows:
         """The number of windows."""
         return len(self.end_s)
 
-    def first(self, count: int) -> SurfaceWindows:
+    def first(self, count: int) -> "SurfaceWindows":
         """The first `count` of them."""
         return SurfaceWindows(self.end_s[:count], self.x[:count], self.recent[:count], self.rolled_m[:count])
 

@@ -1,9 +1,8 @@
 """Parameters as the solver sees them: scaled by their priors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
+from typing import Self
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
@@ -49,7 +48,7 @@ class Coordinate:
     start: float
 
     @classmethod
-    def of(cls, name: str, quantity: Quantity, start: float, prior: Prior | None) -> Coordinate:
+    def of(cls, name: str, quantity: Quantity, start: float, prior: Prior | None) -> Self:
         """The coordinate of a number that stands at `start` in the model; without a prior that is the prior.
 
         Raises:

@@ -5,13 +5,11 @@
 `effects.NAME` is an optional effect. A name carries its unit, its range comes with its field.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -69,7 +67,7 @@ class Model:
         path = name.removeprefix("soil.")
         return [f"{soil}.{path}" for soil in self.soils] if name.startswith("soil.") else [name]
 
-    def replaced(self, values: Mapping[str, float]) -> Model:
+    def replaced(self, values: Mapping[str, float]) -> Self:
         """The model with other numbers, by dotted name."""
         vehicle, soils, effects = self.vehicle, dict(self.soils), dict(self.effects)
         for name, value in values.items():

@@ -5,11 +5,10 @@ it is the mean of, so that the twin's mean over the same interval is its exact c
 velocities of GNSS and of a reference are rows at an instant.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +57,7 @@ class Observed:
     correlation: tuple[float, float] | None = None
     timing: Array | None = None
 
-    def select(self, rows: NDArray[np.bool_]) -> Observed:
+    def select(self, rows: NDArray[np.bool_]) -> Self:
         """The rows of a mask."""
         return dataclasses.replace(
             self, begin_s=self.begin_s[rows], end_s=self.end_s[rows], value=self.value[rows],

@@ -6,8 +6,6 @@ start of each window. All have Gaussian priors and are scaled by their prior sig
 is never singular. The poses are eliminated window by window (Schur complement), which marginalises them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +46,7 @@ class Point:
     errors: Array
     pose: tuple[Array, ...]
 
-    def moved(self, dw: Array, derrors: Array, dpose: Sequence[Array]) -> Point:
+    def moved(self, dw: Array, derrors: Array, dpose: Sequence[Array]) -> "Point":
         pose = tuple(p + d for p, d in zip(self.pose, dpose, strict=True))
         return Point(self.w + dw, self.errors + derrors, pose)
 

@@ -5,13 +5,11 @@ same bits alone and among others. With numbers of 32 bits twice as many go toget
 again the same alone and among others.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -99,7 +97,7 @@ class Fleet:
         substeps: int | None = None,
         order: int = 4,
         short: bool = False,
-    ) -> Fleet:
+    ) -> Self:
         """Groups plants that share graph and step, as many as a driver has lanes; arguments as those of
         `integrate_many`.
 

@@ -5,10 +5,9 @@ RK4 steps: the result is the exact derivative of the discrete run, up to roundin
 1993, sec. II.6, internal differentiation).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
@@ -39,7 +38,7 @@ class Directions:
     effects: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
-    def zeros(cls, plant: Plant, count: int, effects: Iterable[str] = ()) -> Directions:
+    def zeros(cls, plant: Plant, count: int, effects: Iterable[str] = ()) -> Self:
         """`count` directions that change nothing yet: fill in what each of them changes."""
         return cls(
             np.zeros((len(STATES), count)), np.zeros((len(VEHICLE_PARAMETERS), count)),

@@ -7,8 +7,6 @@ Body frame: x forward, y left, z up; its origin lies in the ground plane,
 midway between the four contact points.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -141,7 +139,7 @@ class VehicleParams:
     robot: SensorNumbers = field(default_factory=SensorNumbers)
 
     @classmethod
-    def load(cls, name_or_path: str | Path) -> VehicleParams:
+    def load(cls, name_or_path: str | Path) -> "VehicleParams":
         """A vehicle by its name in the library, or from a YAML file; see `load_vehicle`."""
         return load_vehicle(name_or_path)
 

@@ -1,9 +1,8 @@
 """The ground of a run: soil parameters for the integrator, labels and shares for the sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ class Route:
     patch_soil: SoilParams | None = None
 
     @classmethod
-    def of(cls, scenario: Scenario, soils: Mapping[str, SoilParams] | None = None) -> Route:
+    def of(cls, scenario: Scenario, soils: Mapping[str, SoilParams] | None = None) -> Self:
         """The scenario's route with its soils: those given by name, the others loaded.
 
         Raises:

@@ -13,12 +13,10 @@ strict keys. Its numbers are choices, so they stand plain, unit in the key::
       - {terrain: loose_sand}
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,7 +188,7 @@ class Scenario:
 
     def with_ground(
         self, terrain: str | None, slope_deg: float | None, cross_slope_deg: float | None = None
-    ) -> Scenario:
+    ) -> Self:
         """The same drive on one terrain throughout and on another slope, where given.
 
         Raises:
@@ -207,9 +205,7 @@ class Scenario:
             changed = dataclasses.replace(changed, cross_slope_deg=cross_slope_deg)
         return changed
 
-    def with_payload(
-        self, payload_kg: float | None, payload_at_m: tuple[float, float, float] | None
-    ) -> Scenario:
+    def with_payload(self, payload_kg: float | None, payload_at_m: tuple[float, float, float] | None) -> Self:
         """The same drive with another payload, at another place, where given.
 
         Raises:

@@ -1,9 +1,8 @@
 """GNSS receiver: fix classes that come and go, noise, multipath under trees, outages and latency."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ class Sky:
     visible: NDArray[np.bool_]
 
     @classmethod
-    def over(cls, t_s: Array, travel_m: Array, canopy: tuple[Canopy, ...], outages: tuple[Zone, ...]) -> Sky:
+    def over(cls, t_s: Array, travel_m: Array, canopy: tuple[Canopy, ...], outages: tuple[Zone, ...]) -> Self:
         """The sky over a drive; where canopies overlap, the densest counts."""
         density, visible = np.zeros_like(t_s), np.ones(len(t_s), dtype=bool)
         for trees in canopy:

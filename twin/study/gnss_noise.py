@@ -6,12 +6,11 @@ runs, sampled at a rate, processed as in the study, and the size is sought at
 which the mean speed error is the study's: for each run alone, and one for all.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -67,7 +66,7 @@ class NoisyRun:
     unit: Array
 
     @classmethod
-    def of(cls, run: CaseRun, rate_hz: float) -> NoisyRun:
+    def of(cls, run: CaseRun, rate_hz: float) -> Self:
         """The run's positions at `rate_hz` (the antenna moves as the body does), with noise by its seed."""
         t_s = np.arange(int(run.truth_t_s[-1] * rate_hz) + 1) / rate_hz
         enu = np.stack([np.interp(t_s, run.truth_t_s, axis) for axis in run.truth_enu_m.T], axis=1)

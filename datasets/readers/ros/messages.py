@@ -1,7 +1,5 @@
 """Messages of one topic as arrays: the same for ROS 1 and ROS 2."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -128,7 +126,7 @@ class Stream:
                 names = np.where(names == name, name.lstrip("/"), names)
         return names
 
-    def select(self, rows: NDArray[Any]) -> Stream:
+    def select(self, rows: NDArray[Any]) -> "Stream":
         """The messages of a boolean mask, or in the order of an index array."""
         index = np.flatnonzero(rows) if rows.dtype == bool else rows
         new = np.full(len(self), -1, dtype=np.int64)

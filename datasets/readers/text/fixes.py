@@ -1,7 +1,5 @@
 """Fixes in latitude and longitude -> the GNSS channel, with a note for everything assumed or left out."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +40,7 @@ class Fixes:
     velocity_enu_mps: Array | None = None
     sigma_v_mps: Array | None = None
 
-    def select(self, rows: Any) -> Fixes:
+    def select(self, rows: Any) -> "Fixes":
         """The fixes of a boolean mask, slice or index array."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         chosen: dict[str, Any] = {name: None if v is None else v[rows] for name, v in values.items()}

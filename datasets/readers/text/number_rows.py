@@ -1,7 +1,5 @@
 """Files of nothing but numbers, one row a time, of known columns: every cell there and finite."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +47,7 @@ class NumberRows:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> NumberRows:
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "NumberRows":
         """The rows of a mask or of indices."""
         return NumberRows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
 

@@ -1,10 +1,8 @@
 """The runs of a sweep gathered in cells of one or two axes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -65,7 +63,7 @@ class CellAxis:
     edges: Array
 
     @classmethod
-    def of(cls, values: Array) -> CellAxis:
+    def of(cls, values: Array) -> Self:
         """One cell a level where there are few; equal bins otherwise."""
         distinct = levels(values)
         if len(distinct) > MAX_LEVELS:

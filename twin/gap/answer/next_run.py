@@ -3,13 +3,12 @@ counts by how many standard deviations the two effects, at the size found, would
 judged runs together. Together, since the size of an effect is the same in both: an effect that scales with
 the load and one that does not differ as soon as the load changes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +96,7 @@ class Planner:
     known: Array
 
     @classmethod
-    def of(cls, evidence: GapEvidence, sigma: Array, robot: RobotOffsets, scores: Sequence[Score]) -> Planner:
+    def of(cls, evidence: GapEvidence, sigma: Array, robot: RobotOffsets, scores: Sequence[Score]) -> Self:
         """After judged runs with these scores."""
         return cls(evidence, sigma, robot, np.sum([beyond_scatter(s.A, robot) for s in scores], axis=0))
 

@@ -1,11 +1,10 @@
 """From the evidence of sets of effects to a verdict."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -79,7 +78,7 @@ class GapVerdict:
         """The most probable of the named causes that cannot be distinguished from others."""
         return next((c for c in self.causes if c.effect in self.named and len(c.members) > 1), None)
 
-    def where_drives_differ(self, sure: bool = True) -> GapVerdict:
+    def where_drives_differ(self, sure: bool = True) -> Self:
         """On drives unlike the references': undecided where no effect explains the gap well, as it may come
         from the drives, or where the test is not `sure`."""
         if sure and self.kind != "unknown" and self.log_odds >= 0.0:

@@ -1,14 +1,12 @@
 """Which trials there are: families, settings, drives, severities, ground, effects; drawn from one seed."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -53,7 +51,7 @@ class CheckSize:
     outside: int
     pairs: int
 
-    def part(self, share: float) -> CheckSize:
+    def part(self, share: float) -> "CheckSize":
         """Only `share` (0 to 1] of the trials of every family, rounded up."""
         return CheckSize(*(math.ceil(share * count - 1e-9) for count in dataclasses.astuple(self)))
 
@@ -94,7 +92,7 @@ class Trial:
         return tuple(shapes()[key].effect for key in self.shapes)
 
     @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Trial:
+    def from_json(cls, entry: Mapping[str, Any]) -> Self:
         lists = {key: tuple(entry[key]) for key in ("shapes", "values")}
         return cls(**{**entry, **lists})
 

@@ -4,11 +4,10 @@ An effect is one hypothesis and its forms are alternatives within it. A column i
 its typical size (`scale` of the catalogue), so that all columns are comparable.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +55,7 @@ class Candidates:
     world_fixed: frozenset[str]
 
     @classmethod
-    def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Candidates:
+    def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Self:
         """The named effects; None: all candidates of the catalogue, registered ones included.
 
         Args:

@@ -5,14 +5,13 @@ the nuisance basis, theta the states that legitimately vary from run to run (soi
 start of each window. Poses are projected out; theta stays, and its variance is learnt from the references.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +67,7 @@ class RunResiduals:
     by_nuisance: list[Array]
     by_pose: list[Array]
 
-    def without_nuisance(self) -> RunResiduals:
+    def without_nuisance(self) -> Self:
         """Without the nuisance basis: half of all columns, which only the scores need."""
         return dataclasses.replace(self, by_nuisance=[p[:, :0] for p in self.by_nuisance])
 
@@ -121,7 +120,7 @@ class WhitenedRun:
         """(n, P) columns of the effects and the nuisance basis."""
         return self.rows[:, self.states : -1].astype(float)
 
-    def with_columns(self, columns: Array) -> WhitenedRun:
+    def with_columns(self, columns: Array) -> Self:
         """With further whitened columns (n, D) behind those of effects and nuisance."""
         rows = np.column_stack([self.rows[:, :-1], columns.astype(np.float32), self.rows[:, -1]])
         old, inner = self.rows.shape[1] - 1, rows.astype(float).T @ columns
