@@ -92,11 +92,6 @@ class Ground:
         """Windows on this ground."""
         return float(self.signature.count.max())
 
-    @property
-    def stretches(self) -> float:
-        """Stretches in which slip was measured."""
-        return float(self.motion.count[0])
-
     def variance(self) -> Array:
         """(10,) of a window's signature, shrunk to `SPREAD`."""
         n = self.signature.count

@@ -31,7 +31,6 @@ from terrafusion.fusion.training.surface_features import (
 )
 
 SCHEMA = "terrafusion.surface/2"
-UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
 STRADDLES = round(WINDOW_S / HOP_S)
 """Windows after a change that contain some of the ground before: for them only the last second is used."""

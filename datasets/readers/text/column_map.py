@@ -104,7 +104,6 @@ class ColumnMapFile(DescriptionFile):
     held: dict[str, Annotated[float, ROWS]] = field(default_factory=dict)
 
 
-KEYS = tuple(f.name for f in dataclasses.fields(ColumnMapFile))
 META_KEYS = tuple(f.name for f in dataclasses.fields(DescriptionFile))
 
 
