@@ -15,6 +15,7 @@ from terrafusion.fusion.cli.common import (
     progress_bar,
     read_json,
     refuse_impossible,
+    refuse_no_yaml,
 )
 from terrafusion.fusion.cli.outputs import Output
 
@@ -129,14 +130,12 @@ def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path, of_t
     """Learn the sensor numbers of a robot, and write its file; options of the twin are wrong usage."""
     import dataclasses
 
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors
 
     if of_the_twin:
         raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+    refuse_no_yaml(out)
     recordings = how.open_all(logs, load_rig(vehicle))
     for recording in recordings:
         refuse_impossible(recording.name, recording)

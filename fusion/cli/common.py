@@ -174,6 +174,18 @@ def refuse_errors(
     return findings
 
 
+def refuse_no_yaml(out: Path) -> None:
+    """Refuse a name for a vehicle file that is none of a YAML file.
+
+    Raises:
+        ConfigError: naming it.
+    """
+    from terrafusion.datasets.core.errors import ConfigError
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+
+
 def refuse_impossible(log: str, recording: Recording) -> None:
     """Refuse a log with numbers beyond anything possible.
 

@@ -16,6 +16,7 @@ from terrafusion.fusion.cli.common import (
     command_line,
     parse_topics,
     progress_bar,
+    refuse_no_yaml,
 )
 
 if TYPE_CHECKING:
@@ -97,11 +98,9 @@ def init(
 
 def _answers(out: Path, vehicle_name: str | None, **texts: str | None) -> Answers:
     """What the options say of the robot, by the names of the vehicle file."""
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.init.answers import Answers
 
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+    refuse_no_yaml(out)
     given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
     return Answers(vehicle_name or out.stem, **given)
 

@@ -13,6 +13,7 @@ from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
+    from terrafusion.datasets.core.recording import Recording
     from terrafusion.twin.analysis.summary import RunSummary
     from terrafusion.twin.simulate import SimulatedRun
 
@@ -82,15 +83,18 @@ def simulate(
         noiseless=noiseless,
         effects=effect_values(effect or []),
     )
-    if out.suffix == ".mcap":
-        from terrafusion.datasets.writers.mcap import write_mcap
-
-        write_mcap(run.recording, out, overwrite=True)
-    else:
-        from terrafusion.datasets.writers.log_folder import write_log_folder
-
-        write_log_folder(run.recording, out)
+    _write(run.recording, out)
     return Result(summary_lines(run), f"written to {out}", document(run, out))
+
+
+def _write(recording: Recording, out: Path) -> None:
+    """Write the log as an MCAP bag where `out` is named so, else as a log folder."""
+    from terrafusion.datasets.writers import write_log_folder, write_mcap
+
+    if out.suffix == ".mcap":
+        write_mcap(recording, out, overwrite=True)
+    else:
+        write_log_folder(recording, out)
 
 
 def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
