@@ -19,7 +19,8 @@ JSON is hashed with sorted keys and without what differs from run to run of the 
     rows[].seconds                        benchmark.json: wall clock
     origin.commit, origin.sources         benchmark.json: hash of the checkout and of the source files
 
-In printed text "24 x real time" and a closing "(12.3 s)" are blanked; so are the paths of scratch and data.
+In printed text "24 x real time", a closing "(12.3 s)" and the date and time in the name of an output folder
+are blanked; so are the paths of scratch and data.
 A benchmark's folder `parts` is left out: it is only there to resume.
 
 Exit status of `check`: 0 all the same, 1 something differs or is not in the store.
@@ -50,7 +51,11 @@ from typing import Any
 
 HASHED = {".json", ".jsonl", ".csv", ".tum", ".yaml", ".md", ".txt", ".mcap", ".parquet"}
 VOLATILE = {"realtime_factor", "update_latency_ms", "rows[].seconds", "origin.commit", "origin.sources"}
-VOLATILE_TEXT = ((r"\d+(\.\d+)? x real time", "_ x real time"), (r"\(\d+\.\d s\)$", "(_ s)"))
+VOLATILE_TEXT = (
+    (r"\d+(\.\d+)? x real time", "_ x real time"),
+    (r"\(\d+\.\d s\)$", "(_ s)"),
+    (r"-\d{8}-\d{6}\b", "-DATE-TIME"),
+)
 LIMIT_S = 1200.0
 ENVIRONMENT = {
     "COLUMNS": "120", "NO_COLOR": "1", "TERM": "dumb",
