@@ -100,13 +100,14 @@ def compute(work: Work) -> dict[str, list[dict[str, Any]]]:
 def true_numbers(robot: Robot) -> dict[str, float]:
     """The numbers that self-calibration looks for. Slip makes that of the wheels larger than the tyre's.
 
-    The body's origin lies between the driven wheels; samples of the IMU are stamped at their end.
+    The body's origin lies between the driven wheels. Samples of the IMU are means up to their stamps, as the
+    estimator takes them, so that no delay belongs to them.
     """
     ahead_m = 0.5 * robot.wheelbase_m if robot.drive == "differential" else 0.0
     return {
         "antenna_x_m": robot.antenna_m[0] - ahead_m,
         "antenna_y_m": robot.antenna_m[1],
-        "gnss_delay_s": robot.fix_delay_s - 0.5 / robot.imu_hz,
+        "gnss_delay_s": robot.fix_delay_s,
         "imu_yaw_rad": robot.imu_yaw_rad,
         "turn_scale": 1.0 / robot.gyro_scale - 1.0,
         "wheel_scale": robot.wheel_error - 1.0,
