@@ -272,7 +272,7 @@ def _numbers(
         scale = 1.0
         if name == "yaw_factor":
             offset, scale = factor, factor
-        columns: list[Array] = [after.mean, after.sigma, before.mean, before.sigma]
+        columns: list[Array] = [after.mean, after.stated_sigma(before), before.mean, before.sigma]
         mean, sigma, mean_before, sigma_before = (float(column[row]) for column in columns)
         if name not in left_out:
             found[name] = LearnedNumber(

@@ -88,4 +88,4 @@ def _spread(squares: Sequence[Array], assumed: float) -> float:
 
 def information_gained(before: Knowledge, after: Knowledge) -> Array:
     """Information gained on each number (7,), nats: the logarithm of its sigma before over after."""
-    return np.asarray(np.log(before.sigma / after.sigma))
+    return np.asarray(np.log(before.sigma / after.stated_sigma(before)))

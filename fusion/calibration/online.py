@@ -34,6 +34,7 @@ class SelfCalibration:
         known: the numbers by now.
         before: the numbers when the stretch under way began.
         misfit: variance of the fixes' residuals at the last step over that of their noise.
+        usual_sigma_m: median 1 sigma of the newest fixes.
     """
 
     def __init__(self, prior: Knowledge, noise: Noise, antenna_m: complex) -> None:
@@ -56,7 +57,7 @@ class SelfCalibration:
         self._samples: list[tuple[float, float, float]] = []
         self._fixes: list[tuple[float, float, float, float]] = []
         self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
-        self._usual_sigma_m = 0.0
+        self.usual_sigma_m = 0.0
         self._state: Array | None = None
         self._work: Reduction | None = None
         self._reduced = False
@@ -86,7 +87,7 @@ class SelfCalibration:
         self._samples.append((self._now_s, distance_m, turn_rad))
         self._rolled_m += abs(distance_m)
         apart_s = self._now_s - self._node_s
-        if node_due(apart_s, self._rolled_m, self._usual_sigma_m):
+        if node_due(apart_s, self._rolled_m, self.usual_sigma_m):
             self._first.append(len(self._drive.distance_m) + len(self._samples))
             self._node_s, self._rolled_m = self._now_s, 0.0
 
@@ -99,7 +100,7 @@ class SelfCalibration:
             self._fixes.append((t_s, float(enu_m[0]), float(enu_m[1]), sigma_m))
             self._last_fix_s = t_s
             self._sigmas_m.append(sigma_m)
-            self._usual_sigma_m = statistics.median(self._sigmas_m)
+            self.usual_sigma_m = statistics.median(self._sigmas_m)
 
     def advance(self) -> bool:
         """A slice of the step under way, or of the next one where that is due; True when it ends and the

@@ -377,7 +377,7 @@ class Estimator:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
         self.weights.update(state, self.imu, self.wheels, self._skid.friction)
-        self.learned.advance(state.t_ns)
+        self.learned.advance(self.chain)
 
     def _wheel_increment(
         self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 
 import gtsam
 import numpy as np
@@ -52,10 +53,12 @@ LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 rotation look alike (assumed)."""
 MOST_SPREAD = 0.1
 """Spread of slip beyond which the wheels do not roll, and a slide looks like a delay (assumed)."""
+SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
+"""A slide shows within this time (assumed); so many steps of learning reach further back."""
 LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
 """Fixes later than this can look like a slide; the delay explains them if they then lie within about three of
 their sigma: a slide leaves a hundred and more (assumed)."""
-CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
+CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 3.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
 
@@ -91,6 +94,7 @@ class LearnedNumbers:
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known = prior
         self._before_slide: Knowledge | None = None
+        self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
             self._apply(prior, 0, known.wheel_scale is not None)
 
@@ -135,21 +139,29 @@ class LearnedNumbers:
             return
         skid = self._gnss.skid
         if skid.friction is not None and skid.friction.leads:
-            self._forget(self._before_slide or learning.before)
+            self._forget(self._before_slide or self._untouched(chain, learning))
             return
-        self._mark_slide(learning, skid.rate_m2ps > 0.0)
+        self._mark_slide(chain, learning, skid.rate_m2ps > 0.0)
         pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
         t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
         learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
 
-    def advance(self, t_ns: int) -> None:
-        """A slice of learning's work, at keyframe `t_ns`; correct the sensors when it gives new numbers."""
+    def advance(self, chain: Chain) -> None:
+        """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new
+        numbers.
+        """
         learning = self.calibration
         if learning is None or not learning.advance():
             return
         if self._before_slide is None or self._late_fixes(learning):
-            self._known = learning.known
+            self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
+            self._past.append((t_ns, self._known))
+            antenna_m, delay_s = gnss.antenna_m, gnss.delay_s
             self._apply(self._known, t_ns)
+            speed_mps = float(np.linalg.norm(chain.state(chain.last).velocity))
+            moved_m = math.hypot(*(gnss.antenna_m - antenna_m)[:2], speed_mps * (gnss.delay_s - delay_s))
+            if moved_m > learning.usual_sigma_m:
+                _doubt_place(chain, moved_m)
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
         """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
@@ -172,7 +184,7 @@ class LearnedNumbers:
         return float(delay_s), float(self._known.sigma[GNSS_DELAY])
 
     def _of_fixes(self, prior: Knowledge) -> list[NumberAfterDrive]:
-        mean, sigma = self._known.mean.tolist(), self._known.sigma.tolist()
+        mean, sigma = self._known.mean.tolist(), self._known.stated_sigma(prior).tolist()
         corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))
         return [
             NumberAfterDrive(name, mean[i], sigma[i], float(prior.sigma[i]), corrects.get(i, False))
@@ -180,17 +192,22 @@ class LearnedNumbers:
             if i != GYRO_BIAS
         ]
 
-    def _mark_slide(self, learning: SelfCalibration, slides: bool) -> None:
+    def _mark_slide(self, chain: Chain, learning: SelfCalibration, slides: bool) -> None:
         """Keep what was known before a slide, or before late fixes that look like one.
 
         Where late fixes explain it, learning goes on; after a slide it begins again.
         """
         if slides and self._before_slide is None:
-            self._before_slide = learning.before
+            self._before_slide = self._untouched(chain, learning)
         elif not slides and self._before_slide is not None:
             if not self._late_fixes(learning):
                 self._forget(self._before_slide)
             self._before_slide = None
+
+    def _untouched(self, chain: Chain, learning: SelfCalibration) -> Knowledge:
+        """What was known before a slide that shows now began."""
+        until_ns = chain.nodes[-1].t_ns - SLIDE_SEEN_NS
+        return next((known for t_ns, known in reversed(self._past) if t_ns <= until_ns), learning.before)
 
     def _late_fixes(self, learning: SelfCalibration) -> bool:
         """Whether a constant delay of rolling wheels explains a drive that looks like a slide."""
@@ -199,6 +216,7 @@ class LearnedNumbers:
 
     def _forget(self, known: Knowledge) -> None:
         self._before_slide, self._known = None, known
+        self._past.clear()
         if self.calibration is not None:
             self.calibration.restart(known)
 
@@ -227,20 +245,26 @@ class LearnedNumbers:
     def _corrections(self, known: Knowledge) -> Array:
         """The numbers (4,) of `CORRECTED`: as known before, but where the drive clearly shows others.
 
-        Those are conditional on the rest being as before: at one speed an antenna further ahead and fixes
-        that come earlier cannot be told apart.
+        At one speed an antenna further ahead and fixes that come earlier cannot be told apart: what is shown
+        is conditional on those numbers being as before that the drive does not refute.
         """
         mean, before = known.mean[CORRECTED], self._before.mean[CORRECTED]
         covariance = known.covariance[np.ix_(CORRECTED, CORRECTED)]
-        off, sigma = np.abs(mean - before), np.sqrt(np.diag(covariance))
+        off, sigma = np.abs(mean - before), known.sigma[CORRECTED]
         limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
         rolling = known.slip_spread < MOST_SPREAD
         self._clear = clear = (off > limit * sigma) & (off > LEAST_CORRECTION) & rolling
-        out = before.copy()
-        if clear.any():
-            gain = covariance[np.ix_(clear, ~clear)] @ np.linalg.pinv(covariance[np.ix_(~clear, ~clear)])
-            out[clear] = mean[clear] + gain @ (before - mean)[~clear]
+        out, kept = before.copy(), off < REFUTED_SIGMA * sigma
+        gain = covariance[np.ix_(clear, kept)] @ np.linalg.pinv(covariance[np.ix_(kept, kept)])
+        out[clear] = mean[clear] + gain @ (before - mean)[kept]
         return out
+
+
+def _doubt_place(chain: Chain, moved_m: float) -> None:
+    """Let the next fixes move the newest place by what a new antenna or delay has shifted them."""
+    doubt = np.zeros(chain.dim)
+    doubt[3:5] = moved_m**2
+    chain.restart(doubt)
 
 
 def _prior(config: EstimatorConfig) -> Knowledge:

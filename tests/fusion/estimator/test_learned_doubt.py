@@ -8,12 +8,26 @@ import math
 import numpy as np
 import pytest
 
-from terrafusion.fusion.calibration.numbers import GNSS_DELAY, NUMBERS, TURN_SCALE, Knowledge
+from terrafusion.fusion.calibration.numbers import (
+    ANTENNA_X,
+    GNSS_DELAY,
+    IMITATED,
+    NUMBERS,
+    TURN_SCALE,
+    Knowledge,
+    assumed,
+)
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.learned_numbers import TURN_TIME_S, with_turn_doubt
+from terrafusion.fusion.estimator.learned_numbers import (
+    SLIDE_SEEN_NS,
+    TURN_TIME_S,
+    _doubt_place,
+    with_turn_doubt,
+)
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
 from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
 
 SCALE_SIGMA, RATE_RADPS, STEP_S = 0.02, 0.3, 0.1
 IMU = load_vehicle("husky").rig().sensors.imu
@@ -52,11 +66,60 @@ def test_the_doubt_is_bounded_where_no_fix_was_used() -> None:
     assert added_density(math.inf) == pytest.approx(SCALE_SIGMA * RATE_RADPS * math.sqrt(TURN_TIME_S))
 
 
-@pytest.mark.parametrize(("sigma_s", "corrected_s"), [(0.15, 0.0), (0.1, 0.4)])
-def test_a_delay_corrects_from_three_of_its_sigmas_on(sigma_s: float, corrected_s: float) -> None:
+@pytest.mark.parametrize(("sigma_s", "corrected_s"), [(0.12, 0.0), (0.09, 0.4)])
+def test_a_delay_corrects_from_four_of_its_sigmas_on(sigma_s: float, corrected_s: float) -> None:
     estimator = Estimator.for_vehicle("elevate", "fixed")
     prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
     mean, sigma = prior.mean.copy(), prior.sigma
     mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.4, sigma_s
     estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03), 1)
     assert estimator.gnss.delay_s == pytest.approx(corrected_s)
+
+
+def test_a_delay_is_not_corrected_by_what_the_antenna_explains() -> None:
+    """Given an antenna at its nominal place, the fixes would be .35 s late; by both together they are not."""
+    estimator = Estimator.for_vehicle("elevate", "fixed")
+    prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
+    mean, covariance = prior.mean.copy(), prior.covariance.copy()
+    mean[ANTENNA_X], mean[GNSS_DELAY] = -0.12, 0.1
+    covariance[ANTENNA_X, ANTENNA_X], covariance[GNSS_DELAY, GNSS_DELAY] = 0.02**2, 0.05**2
+    covariance[ANTENNA_X, GNSS_DELAY] = covariance[GNSS_DELAY, ANTENNA_X] = 0.9 * 0.02 * 0.05
+    estimator.learned._apply(Knowledge(mean, covariance, 0.03), 1)
+    assert estimator.gnss.delay_s == 0.0
+
+
+def test_a_stated_sigma_holds_what_slip_imitates_but_no_more_than_was_known() -> None:
+    before = assumed(0.0, False, 0.05)
+    exact = Knowledge(before.mean, 1e-12 * np.eye(len(NUMBERS)), 0.05)
+    assert exact.stated_sigma(before) == pytest.approx(np.minimum(IMITATED, before.sigma), abs=1e-5)
+    told = Knowledge(before.mean, np.diag(np.full(len(NUMBERS), 1e-3) ** 2), 0.05)
+    assert (exact.stated_sigma(told) <= told.sigma).all()
+
+
+@pytest.fixture(scope="module")
+def driving() -> Estimator:
+    """An estimator in the middle of a drive."""
+    run, estimator = (
+        simulate("figure_eight", terrain="asphalt", seed=4),
+        Estimator.for_vehicle("elevate", "fixed"),
+    )
+    for message in run.messages():
+        if message.t_ns > run.start_ns + 20_000_000_000:
+            break
+        estimator.add(message)
+    return estimator
+
+
+def test_fixes_may_move_the_place_by_what_a_new_delay_and_antenna_shift_them(driving: Estimator) -> None:
+    before = driving.chain.covariance()[3:5, 3:5]
+    _doubt_place(driving.chain, 0.5)
+    assert driving.chain.covariance()[3:5, 3:5] - before == pytest.approx(0.25 * np.eye(2), abs=1e-6)
+
+
+def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estimator) -> None:
+    learned, now_ns = driving.learned, driving.chain.nodes[-1].t_ns
+    assert learned.calibration is not None
+    assert learned._untouched(driving.chain, learned.calibration) is learned.calibration.before
+    sure, late = (dataclasses.replace(learned.calibration.before, slip_spread=s) for s in (0.01, 0.02))
+    learned._past.extend([(now_ns - SLIDE_SEEN_NS, sure), (now_ns, late)])
+    assert learned._untouched(driving.chain, learned.calibration) is sure
