@@ -63,27 +63,6 @@ PRODUCT = (
         },
     ),
     Study(
-        "fault_matrix_late",
-        "Do sensors that are late or swapped pass as good on cells that no rule was set on?",
-        module(
-            "fault_matrix.matrix",
-            "--first",
-            "640",
-            "--cells",
-            "360",
-            "--faults",
-            "lag",
-            "swapped",
-            "--out",
-            OUT,
-        ),
-        3,
-        {
-            "cells": r"cells (\d+)",
-            **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
-        },
-    ),
-    Study(
         "kills",
         "Does a command that is killed, or a machine in trouble, leave half a result that passes for whole?",
         module("kills.kills", "--out", OUT),

@@ -37,7 +37,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix", "fault_matrix_late",
+    "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix",
     "coarse_slides",
 )  # fmt: skip
 
