@@ -1,12 +1,12 @@
 """The angle at which an IMU is mounted about its vertical axis, from its accelerations and the wheels'.
 
-Over a second the body gains the speed that the wheels gain, ahead, and speed times turn to its left. A turned
-IMU measures the same vector rotated::
+Over a second the body gains the speed that the wheels gain, ahead, and speed times turn to its left; an IMU
+away from the body's origin gains more as the body turns. A turned IMU measures the same vector rotated::
 
-    y = e^(-i angle) (change of speed + i speed turn) + constant
+    y = e^(-i angle) (change of speed + i speed turn + place (i change of rate - time rate^2)) + constant
 
-with complex numbers for vectors (ahead + i left), which is linear in e^(-i angle). The constant, gravity on a
-slope and bias, is taken out of each block of some ten seconds.
+with complex numbers for vectors (ahead + i left), which is linear in e^(-i angle) and in its product with the
+place. The constant, gravity on a slope and bias, is taken out of each block of some ten seconds.
 """
 
 from __future__ import annotations
@@ -29,7 +29,11 @@ both. A hill on which a robot always slows down turns the vector round, but only
 ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
 """1 sigma of an angle of which nothing is known."""
 LEAST_SIGMA_RAD = math.radians(1.0)
-"""Wheels that slip with acceleration and an IMU off the centre turn the vector by as much (assumed)."""
+"""Wheels that slip with acceleration turn the vector by as much (assumed)."""
+PLACE_M = 0.5
+"""1 sigma of the place of the IMU, each axis: it is somewhere on a robot (assumed)."""
+JOINT = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 1.0]])
+"""Columns of speed and turn become that of the vector that both make; that of the place stays."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,8 @@ class MountingAngle:
     def __init__(self) -> None:
         self.angle: Angle | None = None
         self._moves: list[tuple[float, float, float, complex]] = []
-        self._windows: list[tuple[float, float, complex]] = []
-        self._square, self._product = np.zeros((2, 2)), np.zeros(2, dtype=complex)
+        self._windows: list[tuple[float, float, complex, complex]] = []
+        self._square, self._product = np.zeros((3, 3), dtype=complex), np.zeros(3, dtype=complex)
         self._energy, self._freedom = 0.0, 0
 
     def interrupt(self) -> None:
@@ -67,12 +71,14 @@ class MountingAngle:
         self._moves.append((dt_s, rolled_m / dt_s, turn_rad, complex(*force_mps2[:2]) * dt_s))
         if sum(dt for dt, *_ in self._moves) < WINDOW_S + dt_s:
             return False
-        _, speed_mps, turn, gained_mps = np.array(self._moves).T
+        dt, speed_mps, turn, gained_mps = np.array(self._moves).T
         weight = np.ones(len(self._moves))
         weight[[0, -1]] = 0.5  # speeds are means of their interval: they hold at its middle
         ahead = float((speed_mps[-1] - speed_mps[0]).real)
         left = float((weight * speed_mps * turn).sum().real)
-        self._windows.append((ahead, left, complex((weight * gained_mps).sum())))
+        rate = (turn / dt).real
+        swung = complex(-float((weight * turn.real * rate).sum()), rate[-1] - rate[0])
+        self._windows.append((ahead, left, swung, complex((weight * gained_mps).sum())))
         self._moves = self._moves[-1:]
         if len(self._windows) < BLOCK:
             return False
@@ -82,24 +88,30 @@ class MountingAngle:
 
     def _add_block(self, windows: Complex) -> None:
         about = windows - windows.mean(axis=0)
-        moved, measured = about[:, :2].real, about[:, 2]
-        self._square += moved.T @ moved
-        self._product += moved.T @ measured
+        moved, measured = about[:, :3], about[:, 3]
+        self._square += moved.conj().T @ moved
+        self._product += moved.conj().T @ measured
         self._energy += float((np.abs(measured) ** 2).sum())
         self._freedom += len(windows) - 1
         self.angle = self._fitted()
 
     def _fitted(self) -> Angle | None:
-        if self._freedom < LEAST_FREEDOM or np.linalg.cond(self._square) > 1e6:
+        if self._freedom < LEAST_FREEDOM or np.linalg.cond(self._square[:2, :2]) > 1e6:
             return None
-        moved = float(np.trace(self._square))
-        rotation = complex(self._product[0] - 1j * self._product[1]) / moved
-        left_over = max(self._energy - abs(rotation) ** 2 * moved, 0.0)
-        inverse = np.linalg.inv(self._square)
-        alone = inverse @ self._product * np.array([1.0, -1j])
-        sigma = np.sqrt(0.5 * left_over / self._freedom * np.diag(inverse))
+        square, product = JOINT.conj().T @ self._square @ JOINT, JOINT.conj().T @ self._product
+        rotation = product[0] / square[0, 0]
+        noise = max(self._energy - float((rotation.conj() * product[0]).real), 0.0) / self._freedom
+        for _ in range(2):  # the place's prior counts by the noise, which is less once the place is known
+            prior = np.diag([0.0, 0.5 * noise / PLACE_M**2 + 1e-12])
+            found = np.linalg.solve(square + prior, product)
+            noise = max(self._energy - float((found.conj() @ product).real), 0.0) / self._freedom
+        inverse = np.linalg.inv(self._square + np.diag([0.0, 0.0, prior[1, 1]]))
+        alone = (inverse @ self._product)[:2] * np.array([1.0, -1j])
+        sigma = np.sqrt(0.5 * noise * np.diag(inverse)[:2].real)
+        rotation = found[0]
         unit = rotation / max(abs(rotation), 1e-9)
         if ((alone / unit).real < LEAST_ALONG).any() or (sigma > LARGEST_SIGMA).any():
             return None
-        spread = math.sqrt(0.5 * left_over / self._freedom / moved) / abs(rotation)
+        variance = 0.5 * noise * float(np.linalg.inv(square + prior)[0, 0].real)
+        spread = math.sqrt(variance) / abs(rotation)
         return Angle(-math.atan2(rotation.imag, rotation.real), math.hypot(spread, LEAST_SIGMA_RAD))
