@@ -36,10 +36,9 @@ WHEEL_SCALE_SIGMA = 0.05
 """Tyre pressure, wear, a nominal radius, and the mean slip of the ground (assumed)."""
 ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
-GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.1
-"""Receivers without a common clock report up to seconds late; wheels by a queue, and they lead the robot as
-it speeds up where slip grows with force (assumed)."""
-IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.15])
+GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
+"""Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
+IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
 CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01]), 0.05
