@@ -6,11 +6,14 @@ Bokeh is imported only when something is drawn. The page holds Bokeh's script an
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,6 +60,7 @@ class Sheet:
     """
 
     def __init__(self, duration_s: float, outages: Sequence[Outage] = ()) -> None:
+        load_bokeh()
         from bokeh.models import Range1d, Span
 
         end = max(duration_s, 1e-3)
@@ -199,9 +203,22 @@ def compact(values: ArrayLike) -> Any:
     return array.astype(np.float32) if finite.max(initial=0.0) < EXACT_IN_FLOAT32 else array
 
 
+def load_bokeh() -> None:
+    """Import Bokeh, which as it loads looks for settings in the home folder, where there may be none."""
+    try:
+        Path.home()
+    except RuntimeError:  # a container without an entry for the user
+        os.environ["HOME"] = os.devnull
+        try:
+            importlib.import_module("bokeh.settings")
+        finally:
+            del os.environ["HOME"]
+
+
 @cache
 def bokeh_script() -> str:
     """Bokeh's own script, for the page."""
+    load_bokeh()
     from bokeh.resources import Resources
 
     return "\n".join(Resources(mode="inline", components=["bokeh"], minified=True, log_level="error").js_raw)
