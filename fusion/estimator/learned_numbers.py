@@ -58,7 +58,7 @@ SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
 LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
 """Fixes later than this can look like a slide; the delay explains them if they then lie within about three of
 their sigma: a slide leaves a hundred and more (assumed)."""
-CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 3.0
+CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
 From `REFUTED_SIGMA` on a number is no longer taken to be as before while others are corrected."""
