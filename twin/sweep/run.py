@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
-from terrafusion.datasets.core.files import unwritable, write_atomically
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.scratch import is_part
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.model.version import model_sha256, version
@@ -109,11 +109,7 @@ class Store:
         self.folder, self.sweep, self.chunks = folder, sweep, chunks
         self.sha256 = sweep.sha256()
         self._check_same()
-        try:
-            (folder / PARTS_FOLDER).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise unwritable(folder, error) from None
-        if not self.complete():
+        if not self.complete():  # before any part: this file says whose folder it is
             self._write_about(None)
 
     def complete(self) -> bool:
@@ -138,8 +134,8 @@ class Store:
         if not self.complete():
             parts = [pq.read_table(self._part(i)) for i in range(len(self.chunks))]
             self._write_table(self.folder / RUNS_FILE, pa.concat_tables(parts).combine_chunks())
-            counts = pq.read_table(self.folder / RUNS_FILE, columns=["status"])["status"].to_pylist()
-            self._write_about({word: counts.count(word) for word in sorted(set(counts))})
+        counts = pq.read_table(self.folder / RUNS_FILE, columns=["status"])["status"].to_pylist()
+        self._write_about({word: counts.count(word) for word in sorted(set(counts))})
         shutil.rmtree(self.folder / PARTS_FOLDER, ignore_errors=True)
 
     def _part(self, number: int) -> Path:

@@ -217,6 +217,28 @@ def test_what_a_sweep_killed_at_its_begin_left_is_no_other_thing(file: Path, tmp
     assert not part.exists()
 
 
+@pytest.mark.parametrize("about", [0, 1])
+def test_a_sweep_killed_at_its_begin_or_end_is_completed_by_the_next(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, about: int
+) -> None:
+    """Killed before it writes its sweep.json, first or last."""
+    out, seen, write = tmp_path / "out", [], module.write_atomically
+
+    def killed(path: Path, how: Any) -> Path:
+        seen.append(path.name)
+        if seen.count("sweep.json") > about:
+            raise KeyboardInterrupt
+        return write(path, how)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "write_atomically", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run_sweep(load_sweep(file), out)
+    run_sweep(load_sweep(file), out)
+    assert json.loads((out / "sweep.json").read_text())["complete"]
+    assert sorted(path.name for path in out.iterdir()) == ["runs.parquet", "sweep.json"]
+
+
 def test_too_many_runs_are_refused_unless_asked_for(file: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"64 runs are more than 63; .*--max-runs"):
         run_sweep(load_sweep(file), tmp_path / "out", max_runs=63)
