@@ -32,19 +32,35 @@ import pytest
 from tests.datasets.fuzz import cpu_s
 
 ROOT = Path(__file__).parents[2]
+GRAPH = ("tests/fusion/graph/test_chain.py", "tests/fusion/graph/test_batch.py")
+WEIGHTS = ("tests/fusion/weighting/test_weights.py",)
+MODES = "tests/fusion/weighting/test_modes.py::"
 TARGETS = {
-    "fusion/graph/wheel_factor.py": ("tests/fusion/graph/test_chain.py", "tests/fusion/graph/test_batch.py"),
-    "fusion/graph/gnss_factor.py": ("tests/fusion/graph/test_chain.py", "tests/fusion/graph/test_batch.py"),
+    "fusion/graph/wheel_factor.py": (*GRAPH, "tests/fusion/graph/test_wheel_factor.py"),
+    "fusion/graph/gnss_factor.py": GRAPH,
+    "fusion/graph/slow_states.py": (*GRAPH, "tests/fusion/graph/test_slow_states.py"),
+    "fusion/graph/chain.py": GRAPH,
+    "twin/physics/wheel.py": ("tests/twin/physics",),
+    "twin/physics/terramechanics.py": ("tests/twin/physics",),
     "fusion/metrics/consistency.py": ("tests/fusion/metrics/test_consistency.py",),
+    "fusion/metrics/error_series.py": ("tests/fusion/metrics/test_scores.py",),
+    "fusion/metrics/scores.py": ("tests/fusion/metrics/test_scores.py",),
     "fusion/metrics/verdict.py": ("tests/fusion/metrics/test_verdict.py",),
-    "fusion/weighting/weighting.py": ("tests/fusion/weighting",),
-    "fusion/weighting/innovation.py": ("tests/fusion/weighting",),
+    "fusion/weighting/weighting.py": WEIGHTS,
+    "fusion/weighting/innovation.py": WEIGHTS,
+    "fusion/weighting/robust.py": WEIGHTS,
+    "fusion/weighting/driven_slip.py": ("tests/fusion/weighting/test_driven_slip.py",),
+    "fusion/weighting/adaptive.py": (
+        "tests/fusion/weighting/test_terrain_noise.py",
+        f"{MODES}test_a_robot_the_model_does_not_know_has_the_pooled_noise_until_evidence_comes",
+        f"{MODES}test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot",
+    ),
     "fusion/inputs/door.py": ("tests/fusion/inputs/test_door.py",),
     "fusion/inputs/gyro_unit.py": ("tests/fusion/inputs/test_gyro_unit.py",),
     "twin/gap/infer/single_effects.py": ("tests/twin/gap/infer/test_single_effects.py",),
     "twin/gap/infer/predictive.py": ("tests/twin/gap/infer/test_predictive.py",),
     "twin/gap/infer/other_drives.py": ("tests/twin/gap/infer/test_other_drives.py",),
-}
+}  # fmt: skip
 LONGEST_CPU_S, LONGEST_S = 120.0, 900.0
 HEAVY = ("gtsam", "scipy.stats", "scipy.optimize", "hypothesis")
 """What tests import beside the library; it is in memory before the first child starts."""

@@ -1,13 +1,17 @@
-"""What the terrain detector is given where keyframes are rarer than its updates."""
+"""What the terrain detector is given, and what becomes of the noise by it."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.terrain.features import Window
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import as_vehicle
 
 
@@ -33,3 +37,105 @@ def test_windows_have_the_time_and_acceleration_that_passed(wheels_hz: float) ->
     assert [w.dt_s for w in seen[1:]] == pytest.approx([passed] * (len(seen) - 1))
     rates = [w.wheel_speed_rate_mps2 for w in seen[3:]]
     assert rates == pytest.approx([0.2] * len(rates), abs=0.02)
+
+
+RECORDED = {
+    "slip_mean": ("wheels", ""),
+    "slip_sigma": ("wheels", ""),
+    "wheel_sigma_mps": ("wheels", "m/s"),
+    "side_slip_sigma": ("wheels", ""),
+    "gyro_inflation": ("imu", ""),
+    "gyro_yaw_inflation": ("imu", ""),
+    "accel_inflation": ("imu", ""),
+    "gnss_inflation": ("gnss", ""),
+}
+
+
+def noise_of(vehicle: str = "husky", **options: object) -> TerrainNoise:
+    return TerrainNoise(EstimatorConfig(as_vehicle(vehicle).rig(), vehicle, **options))  # type: ignore[arg-type]
+
+
+def test_a_switch_is_the_share_that_changed_ground_since_it_was_last_asked() -> None:
+    weights = noise_of("elevate")
+    before = np.array(list(weights.posterior().values()))
+    weights.external(0, {name: float(name == "mud") for name in weights.posterior()})
+    after = np.array(list(weights.posterior().values()))
+    assert weights.take_switch() == pytest.approx(0.5 * np.abs(after - before).sum())
+    assert weights.take_switch() == 0.0
+    fixed = noise_of("elevate", mode="fixed")
+    fixed.external(0, {name: float(name == "mud") for name in fixed.posterior()})
+    assert fixed.take_switch() == 0.0
+
+
+@pytest.mark.parametrize("robot", ["husky", "elevate"])
+def test_slip_that_the_robot_shows_is_that_of_ground_no_class_describes(robot: str) -> None:
+    fixed, adaptive = noise_of(robot, mode="fixed"), noise_of(robot)
+    for weights in (fixed, adaptive):
+        weights.learn_slip(0.3, 0.07, 5)
+    assert (fixed.noise.slip_mean, fixed.noise.slip_sigma) == (0.3, 0.07)
+    knows_its_grounds = robot == "elevate"
+    assert (adaptive.noise.slip_mean == pytest.approx(0.3)) != knows_its_grounds
+    assert (adaptive.noise.slip_sigma == pytest.approx(0.07)) != knows_its_grounds
+
+
+def test_changes_of_the_noise_are_recorded_from_a_tenth_on_with_their_reason() -> None:
+    weights = noise_of("elevate")
+    weights.external(0, {"mud": 0.9, "asphalt": 0.1})
+    assert weights.take_changes() == []  # not begun
+    weights.begin(7)
+    now, pooled = dataclasses.asdict(weights.noise), dataclasses.asdict(weights.policy.fixed)
+    names = {change.reason.split(":")[0]: change for change in weights.take_changes()}
+    for name, before in pooled.items():
+        if name in RECORDED:
+            moved = abs(now[name] - before) > 0.1 * max(abs(before), 0.02)
+            assert (name in names) == moved, name
+    assert "slip_mean" in names
+    for name, change in names.items():
+        assert (change.t_ns, change.before, change.after) == (7, pooled[name], now[name])
+        assert (change.sensor, change.unit) == RECORDED[name]
+        p = weights.posterior()
+        best = max(p, key=p.__getitem__)
+        assert change.reason == f"{name}: terrain {best} p = {p[best]:.2f} (external source)"
+    weights.begin(8)
+    assert {change.t_ns for change in weights.take_changes()} == {8}
+    assert weights.take_changes() == []
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"lava": 1.0}, "unknown class 'lava'.*the policy knows .*mud"),
+        ([0.5, 0.5], "names no classes"),
+        ({"mud": float("nan")}, "probabilities"),
+        ({"mud": -1.0}, "probabilities"),
+    ],
+)
+def test_probabilities_that_are_none_are_refused(given: object, said: str) -> None:
+    weights = noise_of()
+    before = weights.posterior()
+    with pytest.raises(DataError, match=said):
+        weights.external(0, given)  # type: ignore[arg-type]
+    assert weights.posterior() == before
+
+
+def test_the_window_of_the_detector_is_that_of_the_last_second() -> None:
+    """Wheels on a circle: 1.0 and 1.5 m/s on a track of 0.55 m."""
+    seen = list[Window]()
+    rig = as_vehicle("husky").rig()
+    estimator = Estimator(EstimatorConfig(rig, "husky"))
+    detector = estimator.weights.detector
+    update = detector.update
+    detector.update = lambda window: (seen.append(window), update(window))[1]  # type: ignore[method-assign]
+    estimator.set_start([0.0, 0.0, 0.0], 0.0)
+    rate = 0.5 / rig.track_m
+    for i in range(600):
+        t_ns = 10**18 + i * 10_000_000
+        estimator.add_imu(t_ns, [0.0, 0.0, rate], [0.0, 0.0, 9.81])
+        if i % 5 == 0:
+            estimator.add_wheels(t_ns, 1.0, 1.5)
+    last = seen[-1]
+    assert last.wheel_speed_mps == pytest.approx(1.25)
+    assert last.yaw_rate_wheels_radps == pytest.approx(rate)
+    assert last.yaw_rate_gyro_radps == pytest.approx(rate, rel=0.01)
+    assert last.imu_t_s[-1] - last.imu_t_s[0] == pytest.approx(1.0, abs=0.02)
+    assert (last.slip, last.slip_sigma) == (None, None)  # no fixes: the slip is what its prior says
