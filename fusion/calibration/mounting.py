@@ -7,10 +7,15 @@ away from the body's origin gains more as the body turns. A turned IMU measures 
 
 with complex numbers for vectors (ahead + i left), which is linear in e^(-i angle) and in its product with the
 place. The constant, gravity on a slope and bias, is taken out of each block of some ten seconds.
+
+Slip makes errors that last for a block: sigma follows the scatter between blocks (Liang and Zeger 1986,
+sandwich estimator), and is wider by as much as the angles from speed and from turns alone disagree beyond
+their own sigma (Birge 1932).
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import dataclass
 
@@ -58,6 +63,7 @@ class MountingAngle:
         self._moves: list[tuple[float, float, float, complex]] = []
         self._windows: list[tuple[float, float, complex, complex]] = []
         self._square, self._product = np.zeros((3, 3), dtype=complex), np.zeros(3, dtype=complex)
+        self._between = np.zeros((6, 6), dtype=complex)
         self._energy, self._freedom = 0.0, 0
 
     def interrupt(self) -> None:
@@ -89,8 +95,11 @@ class MountingAngle:
     def _add_block(self, windows: Complex) -> None:
         about = windows - windows.mean(axis=0)
         moved, measured = about[:, :3], about[:, 3]
-        self._square += moved.conj().T @ moved
-        self._product += moved.conj().T @ measured
+        square, product = moved.conj().T @ moved, moved.conj().T @ measured
+        self._square += square
+        self._product += product
+        joint = np.concatenate([JOINT.conj().T @ product, (JOINT.conj().T @ square @ JOINT).ravel()])
+        self._between += np.outer(joint, joint.conj())
         self._energy += float((np.abs(measured) ** 2).sum())
         self._freedom += len(windows) - 1
         self.angle = self._fitted()
@@ -105,13 +114,21 @@ class MountingAngle:
             prior = np.diag([0.0, 0.5 * noise / PLACE_M**2 + 1e-12])
             found = np.linalg.solve(square + prior, product)
             noise = max(self._energy - float((found.conj() @ product).real), 0.0) / self._freedom
-        inverse = np.linalg.inv(self._square + np.diag([0.0, 0.0, prior[1, 1]]))
-        alone = (inverse @ self._product)[:2] * np.array([1.0, -1j])
-        sigma = np.sqrt(0.5 * noise * np.diag(inverse)[:2].real)
-        rotation = found[0]
-        unit = rotation / max(abs(rotation), 1e-9)
+        alone, sigma = self._alone(prior[1, 1], noise)
+        unit = found[0] / max(abs(found[0]), 1e-9)
         if ((alone / unit).real < LEAST_ALONG).any() or (sigma > LARGEST_SIGMA).any():
             return None
-        variance = 0.5 * noise * float(np.linalg.inv(square + prior)[0, 0].real)
-        spread = math.sqrt(variance) / abs(rotation)
-        return Angle(-math.atan2(rotation.imag, rotation.real), math.hypot(spread, LEAST_SIGMA_RAD))
+        inverse = np.linalg.inv(square + prior)
+        apart_rad = abs(cmath.phase(alone[0] * alone[1].conjugate()))
+        apart_sigma = apart_rad * abs(found[0]) / math.hypot(*sigma.tolist(), 1e-9)
+        variance = 0.5 * noise * float(inverse[0, 0].real) * max(apart_sigma, 1.0) ** 2
+        of_block = inverse @ np.hstack([np.eye(2), -np.kron(np.eye(2), found[None])])
+        between = 0.5 * float((of_block @ self._between @ of_block.conj().T)[0, 0].real)
+        spread = math.sqrt(max(variance, between)) / abs(found[0])
+        return Angle(-cmath.phase(found[0]), math.hypot(spread, LEAST_SIGMA_RAD))
+
+    def _alone(self, place_prior: float, noise: float) -> tuple[Complex, Array]:
+        """What the changes of speed and the turns say alone, each a vector like e^(-i angle), and 1 sigma."""
+        inverse = np.linalg.inv(self._square + np.diag([0.0, 0.0, place_prior]))
+        alone = (inverse @ self._product)[:2] * np.array([1.0, -1j])
+        return alone, np.sqrt(0.5 * noise * np.diag(inverse)[:2].real)

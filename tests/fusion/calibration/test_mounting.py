@@ -25,14 +25,17 @@ def learned(
     seed: int = 0,
     place_m: complex = 0.0,
     swing_radps: float = 0.23,
+    sway: float = 0.0,
 ) -> MountingAngle:
-    """After a drive at 1 m/s that swings by a third; hills add `hill` times the loss of speed."""
+    """After a drive at 1 m/s that swings by a third; hills add `hill` times the loss of speed, and the robot
+    sways to its left by `sway` times the gain.
+    """
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, seconds, DT_S)
     speed = 1.0 + 0.3 * np.sin(0.9 * t_s)
     gained, turn = 0.27 * np.cos(0.9 * t_s), turn_radps * np.sin(swing_radps * t_s)
     body = (1.0 - hill) * gained + 1j * speed * turn + 0.3
-    body = body + place_m * (1j * np.gradient(turn, DT_S) - turn**2)
+    body = body + 1j * sway * gained + place_m * (1j * np.gradient(turn, DT_S) - turn**2)
     noise = noise_mps2 * (rng.normal(size=len(t_s)) + 1j * rng.normal(size=len(t_s)))
     read = body * cmath.exp(-1j * angle_rad) + noise
     found = MountingAngle()
@@ -66,6 +69,29 @@ def test_sigma_holds_the_error_of_noisy_accelerations() -> None:
     off = np.array([(a.rad - 2.0) / a.sigma_rad for a in angles if a is not None])
     assert len(off) >= 35
     assert 0.4 < np.sqrt(np.mean(off**2)) < 1.2
+
+
+def test_sigma_holds_what_speed_and_turns_tell_differently() -> None:
+    """A body that sways as it gains speed: the turns know the angle, the speed is off by 22 degrees."""
+    found = learned(0.0, sway=0.4, noise_mps2=0.2).angle
+    assert found is not None
+    assert 0.05 < abs(found.rad) < 2.0 * found.sigma_rad
+
+
+def test_errors_that_last_for_a_block_count_as_one() -> None:
+    """The wheels' slip changes every ten seconds, in random directions."""
+    rng, off = np.random.default_rng(5), []
+    for _ in range(30):
+        found, t_s = MountingAngle(), np.arange(0.0, 200.0, DT_S)
+        slip = np.repeat(rng.normal(0.0, 0.3, 20) + 1j * rng.normal(0.0, 0.3, 20), 100)
+        speed, turn = 1.0 + 0.3 * np.sin(0.9 * t_s), 0.5 * np.sin(0.23 * t_s)
+        body = (1.0 + slip) * (0.27 * np.cos(0.9 * t_s) + 1j * speed * turn)
+        for v, w, f in zip(speed, turn, body, strict=True):
+            found.add(DT_S, v * DT_S, w * DT_S, force(f))
+        if found.angle is not None:
+            off.append(found.angle.rad / found.angle.sigma_rad)
+    assert len(off) >= 20
+    assert np.mean(np.abs(off) < 2.0) >= 0.75  # .55 where windows count as independent
 
 
 def test_a_straight_drive_tells_no_angle() -> None:
