@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 OUTPUT = Output(
     "Folder for the results; an unfinished one goes on.",
-    ("config.json", "sweep.json", "runs.parquet", "parts", "recordings", "report.html", "*.png"),
+    ("config.json", "sweep.json", "runs.parquet", "parts", "recordings", "report.html"),
     ("sweep.json",),
     goes_on=True,
 )
@@ -39,13 +39,13 @@ def sweep(
     backend: BackendOption = "loky",
     address: AddressOption = None,
     max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
-    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html and plots.")] = True,
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html.")] = True,
     recordings: list[str] | None = None,
     recordings_format: str = "folder",
 ) -> Result:
     """Run a scenario over friction, terrain, slope, payload, speed and seeds.
 
-    Writes runs.parquet (a row a run), sweep.json, report.html and plots. A sweep that was stopped
+    Writes runs.parquet (a row a run), sweep.json and report.html. A sweep that was stopped
     continues with the same command. Built-in sweeps: friction_slope, payload_energy, random_ground,
     sensors_by_ground.
 

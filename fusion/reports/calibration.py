@@ -4,13 +4,17 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
+import numpy as np
+
+from terrafusion.datasets.core.tables import number
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots import calibration as plots
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.calibrate.files import write_files
 from terrafusion.twin.calibrate.identifiability import COMBINED, IDENTIFIED, NOT_IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration
 
-MOST_FIGURES = 6
+MOST_FIGURES = 3
 """Logs beyond this many have no plots of their own in the report; `calibration.json` has their numbers."""
 STATUS = {IDENTIFIED: "yes", COMBINED: "only in combination", NOT_IDENTIFIED: "no"}
 
@@ -39,17 +43,46 @@ def write_calibration(
 
 def write_report(path: Path, c: Calibration, provenance: Mapping[str, object] | None = None) -> Path:
     """The report alone."""
-    lead = (
-        f"{len(c.fitted) - len(c.unidentified())} of {len(c.fitted)} parameters are identified by "
-        f"{len(c.sensor_errors)} log(s), {c.seconds_of_data:.0f} s in all. The search {c.sentence}."
-    )
+    sheet = Sheet()
+    plots.plot_parameters(sheet, c)
+    plots.plot_correlation(sheet, c)
+    fits = {log: plots.plot_channels(sheet, c, log) for log in list(c.sensor_errors)[:MOST_FIGURES]}
     return write_page(
         path, "calibration.html.j2", f"Calibration of {c.model.vehicle.name} on {', '.join(c.model.soils)}",
-        lead=lead, provenance=provenance, packages=TWIN_LIBRARIES, parameters=_parameters(c),
-        channels=_channels(c), weak=[d.sentence for d in c.identifiability.weak], notes=c.notes,
-        figures={"parameters": plots.plot_parameters(c), "correlation": plots.plot_correlation(c)},
-        fits={log: plots.plot_channels(c, log) for log in list(c.sensor_errors)[:MOST_FIGURES]},
+        verdicts=[_verdict(c)], tiles=_tiles(c), provenance=provenance, packages=TWIN_LIBRARIES,
+        parameters=_parameters(c), channels=_channels(c), notes=c.notes, fits=fits, **sheet.parts(),
     )  # fmt: skip
+
+
+def _verdict(c: Calibration) -> VerdictBox:
+    """Whether the numbers can be used, and a sentence for each that cannot, or only together with others."""
+    edges = [f.name for f in c.fitted if f.at_bound]
+    reasons = [f"The search {c.sentence}."]
+    reasons += [f"{name} ended at the end of its range: its sigma says little." for name in edges]
+    reasons += [f"{d.sentence}." for d in c.identifiability.weak]
+    if not c.converged():
+        return VerdictBox("not_to_be_used", "Not to be used: the search did not converge", reasons)
+    known = len(c.fitted) - len(c.unidentified())
+    value = "doubtful" if edges or c.unidentified() else "good"
+    return VerdictBox(value, f"{known} of {len(c.fitted)} parameters are identified", reasons)
+
+
+def _tiles(c: Calibration) -> list[Tile]:
+    """How far the fit helps, what has changed most, and how much data there is."""
+    ratios = [f.rms(f.after) / f.rms(f.before) for f in c.channels if f.rms(f.before) > 0.0]
+    moved = max(c.fitted, key=lambda f: abs(f.value - f.prior) / f.prior_sigma)
+    count = len(c.sensor_errors)
+    return [
+        Tile(
+            "error of the twin, after / before", number(float(np.median(ratios)) if ratios else None),
+            f"median of {len(ratios)} channels, root mean square",
+        ),
+        Tile(
+            "largest change, prior sigmas", f"{(moved.value - moved.prior) / moved.prior_sigma:+.1f}",
+            moved.name,
+        ),
+        Tile("data, s", f"{c.seconds_of_data:.0f}", f"of {count} log{'s' if count > 1 else ''}"),
+    ]  # fmt: skip
 
 
 def _parameters(c: Calibration) -> list[list[str]]:

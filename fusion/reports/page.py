@@ -11,6 +11,7 @@ import io
 import platform
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -28,6 +29,24 @@ LIBRARIES = ("gtsam", "numpy", "scipy")
 TWIN_LIBRARIES = ("casadi", "numpy", "scipy")
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _LONG_NUMBER = re.compile(rb"(\.\d\d)\d+")
+
+
+@dataclass(frozen=True)
+class VerdictBox:
+    """What a report opens with: `value` is "good", "doubtful" or "not_to_be_used", each reason a sentence."""
+
+    value: str
+    title: str
+    reasons: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One of the numbers below the verdict, three at most."""
+
+    label: str
+    value: str
+    about: str
 
 
 def write_page(

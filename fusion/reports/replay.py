@@ -19,7 +19,7 @@ from terrafusion.fusion.reports import replay_text
 from terrafusion.fusion.reports.page import write_page
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter, replay_map, style
-from terrafusion.fusion.reports.plots.sheet import Sheet, bokeh_script
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -118,8 +118,7 @@ def write_report(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
         overview=overview, runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
         scores=rows, baselines=replay_text.shown_baselines(rows),
-        tiles=replay_text.tiles(rows, names, pair[0]), panels=sheet.panels, plots=sheet.json(),
-        library=bokeh_script(), innovations=innovations,
+        tiles=replay_text.tiles(rows, names, pair[0]), **sheet.parts(), innovations=innovations,
         verdicts=replay_text.verdicts(names, metrics), assumed=_assumed(runs),
         reference=replay_text.REFERENCE[shown.scores.against or "truth"],
         label_strip=" The strip on top is the log's own label." if labelled else "",

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.datasets.core.tables import number
+from terrafusion.fusion.reports.page import Tile, VerdictBox
 
 Metrics = Mapping[str, Any]
 
@@ -139,15 +140,6 @@ def _baselines(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
     return tuple(None if errors is None else errors.get(key) for key in BASELINES)
 
 
-@dataclass(frozen=True)
-class Tile:
-    """One of the numbers a report opens with."""
-
-    label: str
-    value: str
-    about: str
-
-
 def tiles(rows: Sequence[ScoreRow], names: Sequence[str], ours: int) -> list[Tile]:
     """The three numbers to see first: error, end of an outage, consistency; else what was scored.
 
@@ -179,20 +171,15 @@ def shown_baselines(rows: Sequence[ScoreRow]) -> list[tuple[int, str]]:
     return [(k, name) for k, name in names if any(row.baselines[k] is not None for row in rows)]
 
 
-def verdicts(names: Sequence[str], runs: Sequence[Metrics]) -> list[dict[str, Any]]:
-    """The verdict of each run that has one: `value`, `title`, `reasons` and what was `assumed`."""
+def verdicts(names: Sequence[str], runs: Sequence[Metrics]) -> list[VerdictBox]:
+    """The verdict of each run that has one."""
     out = []
     for name, metrics in zip(names, runs, strict=True):
         found = metrics.get("verdict")
         if found is not None:
             run = f" ({name})" if len(runs) > 1 else ""
-            out.append(
-                {
-                    "value": found["value"],
-                    "title": f"Verdict{run}: {found['value'].replace('_', ' ')}",
-                    "reasons": found["reasons"],
-                }
-            )
+            title = f"Verdict{run}: {found['value'].replace('_', ' ')}"
+            out.append(VerdictBox(found["value"], title, found["reasons"]))
     return out
 
 

@@ -1,4 +1,4 @@
-"""`report.html` of a sweep, and its plots as PNG files."""
+"""`report.html` of a sweep."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_png
-from terrafusion.fusion.reports.plots.sweep import figures
-from terrafusion.fusion.reports.plots.sweep_cells import Columns, columns_of
+from terrafusion.datasets.core.tables import number
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page
+from terrafusion.fusion.reports.plots.sheet import Sheet
+from terrafusion.fusion.reports.plots.sweep import LABELS, draw
+from terrafusion.fusion.reports.plots.sweep_cells import Columns, columns_of, mobile, varied
 
 if TYPE_CHECKING:
     from terrafusion.twin.sweep.plan import Sweep
 
 MOST_FAILURES = 20
 MEANINGS = {
-    "done": "mobile: drove on to the end",
-    "spinning": "wheels turned, less than a tenth of the commanded distance was driven",
+    "done": "drove on to the end",
+    "spinning": "turned their wheels, but drove less than a tenth of the commanded distance",
     "immobilised": "stopped for good",
     "slid": "ended behind the start",
     "failed": "could not be computed",
@@ -38,40 +40,82 @@ _STATISTICS = (
 
 def write_sweep_report(
     out: Path, sweep: Sweep, table: Any, provenance: Mapping[str, object] | None = None
-) -> list[Path]:
-    """Write `report.html` and its plots (`*.png`) into the folder of a finished sweep.
+) -> Path:
+    """Write `report.html` into the folder of a finished sweep.
 
     Args:
         table: pyarrow `Table` of `run_sweep`.
         provenance: further lines for the last section, such as the command line.
 
     Raises:
-        TerrafusionError: a file cannot be written.
+        TerrafusionError: the file cannot be written.
     """
     columns = columns_of(table)
-    drawn = figures(columns)
-    written = [write_png(out / f"{name}.png", fig) for name, (fig, _) in drawn.items()]
+    sheet = Sheet()
+    groups = draw(sheet, columns)
     about = f"{sweep.description[:1].upper()}{sweep.description[1:]}. " if sweep.description else ""
     made_of = {
         "scenario": sweep.scenario.name, "vehicle": sweep.vehicle.name, "sha256 of the sweep": sweep.sha256(),
     }  # fmt: skip
-    page = write_page(
+    return write_page(
         out / "report.html", "sweep.html.j2", f"Sweep {sweep.name}",
         lead=f"{about}{sweep.vehicle.name} drives {sweep.scenario.name}: {sweep.design()}.",
         provenance=made_of | dict(provenance or {}), packages=(*TWIN_LIBRARIES, "pyarrow"),
-        outcome=_outcome(columns), statistics=_statistics(columns), figures=drawn.values(),
-        failures=_failures(columns),
+        verdicts=[_verdict(columns)], tiles=_tiles(columns), statistics=_statistics(columns), groups=groups,
+        failures=_failures(columns), **sheet.parts(),
     )  # fmt: skip
-    return [*written, page]
 
 
-def _outcome(columns: Columns) -> list[tuple[tuple[str, str], str, str]]:
+def _verdict(columns: Columns) -> VerdictBox:
+    """How many runs drove on to the end, how the others ended, and what that depends on."""
     status = columns["status"]
-    return [
-        ((word, meaning), str(count), f"{100.0 * count / len(status):.1f} %")
-        for word, meaning in MEANINGS.items()
-        if (count := int((status == word).sum()))
-    ]
+    counts = {word: int((status == word).sum()) for word in MEANINGS}
+    value = (
+        "not_to_be_used" if counts["failed"] == len(status) else "doubtful" if counts["failed"] else "good"
+    )
+    others = [word for word in MEANINGS if word != "done" and counts[word]]
+    reasons = [f"{counts[word]} {MEANINGS[word]}." for word in others]
+    reasons += [_along(columns, name) for name in varied(columns)]
+    if len(set(columns["terrain"])) > 1:
+        reasons.append(_along(columns, "terrain"))
+    title = f"{counts['done']} of {len(status)} runs are mobile: they drove on to the end"
+    return VerdictBox(value, title, [reason for reason in reasons if reason])
+
+
+def _along(columns: Columns, name: str) -> str:
+    """The share of mobile runs at the ends of an axis, or on the best and the worst terrain."""
+    run = mobile(columns)
+    known = np.isfinite(run)
+    shares = {
+        at: float(run[known & (columns[name] == at)].mean()) for at in dict.fromkeys(columns[name][known])
+    }
+    if not shares:
+        return ""
+    if name == "terrain":
+        label, order = "Terrain", sorted(shares, key=lambda at: -shares[at])
+        ends = [f"on {order[0]}", f"on {order[-1]}"]
+    else:
+        label, order = LABELS[name].capitalize(), sorted(shares)
+        ends = [f"at {order[0]:g}", f"at {order[-1]:g}"]
+    best, worst = (f"{100.0 * shares[at]:.0f} %" for at in (order[0], order[-1]))
+    return f"{label}: {best} of the runs are mobile {ends[0]}, {worst} {ends[1]}."
+
+
+def _tiles(columns: Columns) -> list[Tile]:
+    """Share of mobile runs, and what a metre costs them."""
+    good, known = columns["status"] == "done", columns["status"] != "failed"
+    share = f"{100.0 * good.sum() / known.sum():.0f} %" if known.any() else number(None)
+    found = [Tile("mobile runs", share, f"{good.sum()} of {known.sum()} that could be computed")]
+    for name, label, factor in (
+        ("mean_slip_ratio", "slip ratio, %", 100.0),
+        ("energy_per_m_j", "energy, J/m", 1.0),
+    ):
+        values = factor * columns[name][good & np.isfinite(columns[name])]
+        if len(values):
+            low, high = values.min(), values.max()
+            about = f"median of the mobile runs, {number(float(low))} to {number(float(high))}"
+            found.append(Tile(label, number(float(np.median(values))), about))
+    return found
 
 
 def _statistics(columns: Columns) -> list[list[str]]:

@@ -1,62 +1,70 @@
-"""Plots of a calibration: its parameters, their correlation, and every channel before and after."""
+"""Figures of a calibration: its parameters, their correlation, and every channel before and after."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.sheet import Sheet, name_ticks
 from terrafusion.twin.calibrate.identifiability import IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-PRIOR = "#d0d0d0"
-
-
-def plot_parameters(calibration: Calibration) -> Figure:
+def plot_parameters(sheet: Sheet, calibration: Calibration) -> None:
     """Each parameter in prior sigmas about its prior, with two sigma; hollow where not identified."""
     fitted = calibration.fitted
-    fig, ax = style.canvas((8.0, 0.9 + 0.36 * len(fitted)))
-    rows = np.arange(len(fitted))[::-1]
-    ax.barh(rows, 4.0, left=-2.0, height=0.5, color=PRIOR)
-    for row, f in zip(rows, fitted, strict=True):
-        at, bar = (f.value - f.prior) / f.prior_sigma, 2.0 * f.sigma / f.prior_sigma
-        face = style.AFTER if f.status == IDENTIFIED else "white"
-        ax.errorbar(at, row, xerr=bar, fmt="o", color=style.AFTER, markerfacecolor=face, capsize=3)
-        start = (f.start - f.prior) / f.prior_sigma
-        ax.plot(start, row, "|", color=style.BEFORE, markersize=14, markeredgewidth=2)
-    ax.set_yticks(rows, [f"{f.name}\n{f.value:.4g} ± {f.sigma:.2g} {f.unit}".rstrip() for f in fitted])
-    style.format_axes(ax, x="prior sigmas from the prior value (dot: fitted, bar: start)")
-    return fig
+    plot = sheet.add_rows(
+        "rows parameters", "prior sigmas from the prior value", [_short(f.name) for f in fitted]
+    )
+    rows = np.arange(len(fitted), dtype=float)
+    prior = {"left": np.array([-2.0]), "right": np.array([2.0])}
+    prior |= {"top": np.array([-0.5]), "bottom": np.array([len(fitted) - 0.5])}
+    label = "two sigma of the prior"
+    plot.glyph("quad", prior, label, style.EXPECTED_ON_ANY, "area", alpha=0.25, line_width=0)
+    value, sigma, start = (
+        np.array([(f.value - f.prior, f.sigma, f.start - f.prior) for f in fitted])
+        / np.array([[f.prior_sigma] for f in fitted])
+    ).T
+    known = np.array([f.status == IDENTIFIED for f in fitted])
+    for chosen, label in ((known, "fitted"), (~known, "not identified")):
+        if chosen.any():
+            mine = value[chosen], (value - 2 * sigma)[chosen], (value + 2 * sigma)[chosen]
+            plot.intervals(rows[chosen], *mine, label, style.AFTER, hollow=label != "fitted")
+    plot.glyph(
+        "scatter", {"x": start, "y": rows}, "start", style.BEFORE, "dot", marker="dash", angle=1.571, size=16
+    )
 
 
-def plot_correlation(calibration: Calibration) -> Figure:
-    """Correlation matrix with its numbers."""
-    names = [f.name.rpartition(".")[2] for f in calibration.fitted]
-    size = 2.2 + 0.55 * len(names)
-    fig, ax = style.canvas((size + 1.2, size))
-    ax.imshow(calibration.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
-    for (i, j), value in np.ndenumerate(calibration.correlation):
-        colour = "white" if abs(value) > 0.6 else "black"
-        ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=8)
-    ax.set_yticks(range(len(names)), names, fontsize=8)
-    return fig
+def plot_correlation(sheet: Sheet, calibration: Calibration) -> None:
+    """Correlation matrix; nothing for one parameter."""
+    from bokeh.palettes import RdBu11, interp_palette
+
+    names = [_short(f.name) for f in calibration.fitted]
+    if len(names) < 2:
+        return
+    edges = np.arange(-0.5, len(names))
+    size = (len(names) - 0.5, -0.5)
+    plot = sheet.add("cells correlation", "", "", 190 + 34 * len(names), y_range=size)
+    plot.cells(edges, edges, calibration.correlation, interp_palette(RdBu11, 256), limits=(-1.0, 1.0))
+    for axis in (plot.panel.figure.xaxis, plot.panel.figure.yaxis):
+        name_ticks(axis, names)
+    plot.panel.figure.xaxis.major_label_orientation = 0.8
 
 
-def plot_channels(calibration: Calibration, log: str) -> Figure:
-    """Every channel of one log over time: measured, the twin before and after."""
+def plot_channels(sheet: Sheet, calibration: Calibration, log: str) -> list[str]:
+    """Every channel of one log over time: measured, the twin before and after; the keys of the figures."""
     fits = [c for c in calibration.channels if c.log == log]
-    fig, axes = style.channel_grid(len(fits), 1.6, 1.5)
-    for ax, fit in zip(axes, fits, strict=True):
-        step = max(1, len(fit.t_s) // style.MAX_POINTS)
-        t_s = fit.t_s[::step]
-        ax.plot(t_s, fit.measured[::step], ".", color=style.TRUTH, markersize=2, label="measured")
-        ax.plot(t_s, fit.before[::step], color=style.BEFORE, linewidth=0.9, label="twin before")
-        ax.plot(t_s, fit.after[::step], color=style.AFTER, linewidth=0.9, label="twin after")
-        style.format_axes(ax, title=fit.channel)
-    style.finish_grid(fig, axes)
-    return fig
+    sheet.begin_axis(max((float(c.t_s[-1]) for c in fits), default=1.0))
+    keys = [f"channel{len(sheet.panels) + i}" for i in range(len(fits))]
+    for key, fit in zip(keys, fits, strict=True):
+        plot = sheet.add_time(key, fit.channel, 170)
+        rows = style.thin(len(fit.t_s))
+        plot.dots(fit.t_s[rows], fit.measured[rows], "measured", style.TRUTH_ON_ANY, size=2.0)
+        plot.line(fit.t_s, fit.before, "twin before", style.BEFORE, width=1.2)
+        plot.line(fit.t_s, fit.after, "twin after", style.AFTER, width=1.2)
+    return keys
+
+
+def _short(name: str) -> str:
+    """The last two words of a dotted name."""
+    return ".".join(name.split(".")[-2:])

@@ -1,4 +1,4 @@
-"""Interactive plots of one drive: Bokeh figures with one time axis and one cursor, as parts of a page.
+"""Interactive plots: Bokeh figures as parts of a page; those of one drive share a time axis and a cursor.
 
 Bokeh is imported only when something is drawn. The page holds Bokeh's script and the data;
 `templates/plots.js` draws the figures, moves the cursor in all of them, and works the legends.
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 EXACT_IN_FLOAT32 = 2.0e4
 """Numbers up to this size are sent in single precision: their steps are below 2 mm there."""
+NO_VALUE = "#80808040"
 _OWN_ID = re.compile(r'"id": "(p\d+)"')
 _ID = re.compile(r'"(p\d+)"')
 """Bokeh numbers its models from the start of the process."""
@@ -59,15 +60,19 @@ class Sheet:
         outages: stretches without GNSS, shaded in each figure over time.
     """
 
-    def __init__(self, duration_s: float, outages: Sequence[Outage] = ()) -> None:
+    def __init__(self, duration_s: float = 1.0, outages: Sequence[Outage] = ()) -> None:
+        self.begin_axis(duration_s)
+        self.outages = outages
+        self.panels: dict[str, Panel] = {}
+
+    def begin_axis(self, duration_s: float) -> None:
+        """Begin a time axis with its cursor, for the figures over time that follow."""
         load_bokeh()
         from bokeh.models import Range1d, Span
 
         end = max(duration_s, 1e-3)
         self.time = Range1d(0.0, end, bounds=(-0.02 * end, 1.02 * end), name="time axis")
         self.cursor = Span(dimension="height", line_color="#808080", visible=False, name="cursor line")
-        self.outages = outages
-        self.panels: dict[str, Panel] = {}
 
     def add_time(
         self, key: str, label: str, height: int = 190, *, log: bool = False, limits: Any = None
@@ -97,22 +102,40 @@ class Sheet:
 
     def add_map(self, key: str, x: str, y: str, height: int = 460) -> Plot:
         """A figure of places, m, one metre as long to the east as to the north."""
+        return self.add(f"map {key}", x, y, height, "pan,wheel_zoom,box_zoom,reset", match_aspect=True)
+
+    def add(
+        self, name: str, x: str, y: str, height: int = 320, tools: str = "pan,box_zoom,reset,save",
+        **options: Any,
+    ) -> Plot:  # fmt: skip
+        """A figure of y over x; its key is the last word of `name`, `options` are of Bokeh's `figure`."""
         from bokeh.plotting import figure
 
         fig = figure(
-            height=height, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, match_aspect=True,
-            toolbar_location="right", name=f"map {key}", tools="pan,wheel_zoom,box_zoom,reset",
-            active_scroll=None,
+            height=height, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, name=name,
+            toolbar_location="right", tools=tools, active_scroll=None, **options,
         )  # fmt: skip
-        return self._added(key, fig, height)
+        return self._added(name.split()[-1], fig, height)
+
+    def add_rows(self, name: str, x: str, rows: Sequence[str], row_px: int = 30, **options: Any) -> Plot:
+        """A figure with a named row for each of 0, 1, ... from the top down."""
+        plot = self.add(name, x, "", 70 + row_px * len(rows), y_range=(len(rows) - 0.5, -0.5), **options)
+        name_ticks(plot.panel.figure.yaxis, rows)
+        plot.panel.figure.ygrid.visible = False
+        return plot
 
     def _added(self, key: str, fig: Figure, height: int) -> Plot:
         fig.toolbar.logo = None
+        fig.title.text_color = style.NEUTRAL
         fig.min_border_right = 4
         for axis in (fig.xaxis, fig.yaxis):
             axis.axis_label_text_font_style = "normal"
         self.panels[key] = Panel(fig, height)
         return Plot(key, self.panels[key])
+
+    def parts(self) -> dict[str, Any]:
+        """What `write_page` needs to show the figures."""
+        return {"panels": self.panels, "plots": self.json(), "library": bokeh_script()}
 
     def json(self) -> str:
         """The figures for `plots.js`: the same values give the same text, safe inside a script element."""
@@ -168,30 +191,81 @@ class Plot:
         self.glyph("scatter", {"x": x, "y": y}, label, colour, "ring" if ring else "dot", **look)
 
     def glyph(
-        self, kind: str, data: Mapping[str, ArrayLike], label: str, colour: str | None, form: str, *,
-        name: str | None = None, more: Mapping[str, ArrayLike] | None = None, **look: Any,
+        self, kind: str, data: Mapping[str, ArrayLike], label: str, colour: Any, form: str, *,
+        name: str | None = None, more: Mapping[str, Any] | None = None,
+        tips: Mapping[str, str] | None = None, **look: Any,
     ) -> None:  # fmt: skip
         """Any of Bokeh's glyphs, whose columns are those of `data`; with `colour` None a column `colour`.
 
         Args:
-            name: of the data, for the script; `more` are columns that only the script reads.
+            name: of the data, for the script.
+            more: columns for the script and for `tips`, what the pointer shows: label to "@column".
         """
-        from bokeh.models import ColumnDataSource
+        from bokeh.models import ColumnDataSource, HoverTool
 
         columns = {key: compact(values) for key, values in (dict(data) | dict(more or {})).items()}
-        getattr(self.panel.figure, kind)(
+        drawn = getattr(self.panel.figure, kind)(
             **{key: key for key in data if key != "colour"},
             source=ColumnDataSource(columns, name=name),
             color=colour or "colour",
             name=f"{self.key}/{label}" if label else None,
             **look,
         )
+        if tips:
+            self.panel.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[*tips.items()], visible=False))
         if label and colour:
             self.note(label, colour, form)
+
+    def intervals(
+        self, rows: Array, values: Array, low: Array, high: Array, label: str, colour: str, *,
+        hollow: bool = False,
+    ) -> None:  # fmt: skip
+        """Dots with their intervals, at rows of `Sheet.add_rows`."""
+        text = [f"{v:.3g} [{a:.3g}, {b:.3g}]" for v, a, b in zip(values, low, high, strict=True)]
+        self.glyph(
+            "segment", {"x0": low, "x1": high, "y0": rows, "y1": rows}, label, colour, "dot", line_width=2
+        )
+        self.glyph(
+            "scatter", {"x": values, "y": rows}, label, colour, "ring" if hollow else "dot", size=8.0,
+            fill_alpha=0.0 if hollow else 1.0, more={"text": text}, tips={label: "@text"},
+        )  # fmt: skip
+
+    def cells(
+        self, x: Array, y: Array, values: Array, palette: Sequence[str], *, log: bool = False,
+        limits: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
+        """A heat map of values (rows, columns) over edges x (columns + 1,), y (rows + 1,); NaN is grey."""
+        from bokeh.models import ColorBar, LinearColorMapper, LogColorMapper
+
+        known = values[np.isfinite(values)]
+        low, high = limits or ((known.min(), known.max()) if len(known) else (0.0, 1.0))
+        kind = LogColorMapper if log else LinearColorMapper
+        mapper = kind([*palette], low=float(low), high=float(high) + 1e-9, nan_color=NO_VALUE)
+        row, column = (index.ravel() for index in np.indices(values.shape))
+        at = {"left": x[column], "right": x[column + 1], "bottom": y[row], "top": y[row + 1]}
+        value = values.ravel()
+        text = [f"{one:.3g}" if np.isfinite(one) else "none" for one in value]
+        middle = {"x": 0.5 * (x[column] + x[column + 1]), "y": 0.5 * (y[row] + y[row + 1])}
+        fig = self.panel.figure
+        places = {fig.xaxis[0].axis_label: "@x{0.###}", fig.yaxis[0].axis_label: "@y{0.###}"}
+        self.glyph(
+            "quad", at, "", {"field": "value", "transform": mapper}, "area",
+            line_width=0, more={"value": value, "text": text} | middle,
+            tips={"value": "@text"} | {label: tip for label, tip in places.items() if label},
+        )  # fmt: skip
+        look = {"background_fill_alpha": 0.0, "major_label_text_color": style.NEUTRAL}
+        bar = ColorBar(color_mapper=mapper, width=10, padding=2, **look)
+        fig.add_layout(bar, "right")
 
     def note(self, label: str, colour: str, form: str) -> None:
         """An entry of the legend."""
         self.panel.legend.setdefault(label, LegendEntry(label, colour, form))
+
+
+def name_ticks(axis: Any, names: Sequence[str]) -> None:
+    """Names in place of the numbers 0, 1, ... of an axis."""
+    axis.ticker = [*range(len(names))]
+    axis.major_label_overrides = dict(enumerate(names))
 
 
 def compact(values: ArrayLike) -> Any:

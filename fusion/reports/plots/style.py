@@ -57,6 +57,8 @@ TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#e69f00"
 """The same where the background may be light or dark."""
 BEFORE, AFTER = "#d55e00", "#0072b2"
 OUTAGE, EXPECTED = "#ffe0b3", "#dddddd"
+LINE_LUMINANCE = (0.13, 0.29)
+"""Relative luminance (WCAG 2.1) of lines that stand out on a light and on a dark page."""
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
 
 TIME = "time from the start, s"
@@ -72,6 +74,20 @@ def colour_of(name: str, table: dict[str, str]) -> str:
 def terrain_colour(name: object) -> str:
     """The colour of a terrain class."""
     return colour_of(str(name), TERRAIN_COLOURS)
+
+
+def line_colour(colour: str) -> str:
+    """The colour, as light or dark as a line needs: a contrast of 3 to a light and to a dark page."""
+    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    light = float(linear @ [0.2126, 0.7152, 0.0722])
+    low, high = LINE_LUMINANCE
+    if light > high:
+        linear *= high / light
+    elif light < low:
+        linear += (low - light) / (1.0 - light) * (1.0 - linear)
+    rgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return "#" + "".join(f"{round(255.0 * x):02x}" for x in rgb)
 
 
 def canvas(size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:

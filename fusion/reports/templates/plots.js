@@ -6,9 +6,7 @@
   const models = [...doc._all_models.values()];
   const named = (start) => models.filter((model) => model.name != null && model.name.startsWith(start));
   const figures = models.filter((model) => model.type === "Figure");
-  const map = figures.find((figure) => figure.name.startsWith("map"));
   const [time] = named("time axis");
-  const [cursor] = named("cursor line");
   const runs = named("run ").map((source) => ({ label: source.name.slice(4), whole: { ...source.data }, source }));
   const readout = document.getElementById("readout");
 
@@ -22,10 +20,11 @@
   };
   const digits = (value, unit) => (Number.isFinite(value) ? value.toFixed(2) + unit : "–");
 
-  // One cursor in time: a line in the figures over time, a mark on each path, and the values as text.
+  // A cursor in time: a line in the figures over time, a mark on each path, and the values as text.
   const [marks] = named("cursor marks");
-  const show = (t) => {
+  const show = (t, cursor) => {
     cursor.setv({ location: t, visible: true });
+    if (readout == null) return;
     const rows = runs.map(({ whole }) => nearest(whole.t, t));
     if (marks != null) {
       marks.data = {
@@ -37,10 +36,12 @@
     readout.textContent = `${t.toFixed(1)} s` + runs.map(({ label, whole }, i) =>
       `  |  ${label}: error ${digits(whole.error[rows[i]], " m")}, slip ${digits(whole.slip[rows[i]], "")}`).join("");
   };
+  const cursor_of = (figure) => figure.center.find((model) => model.name === "cursor line");
+  const [shared] = figures.map(cursor_of).filter((cursor) => cursor != null);
   for (const figure of figures) {
-    const over_time = figure.name.startsWith("over time");
+    const cursor = cursor_of(figure);
     const move = (event) => {
-      if (over_time) return show(Math.min(Math.max(event.x, 0), time.bounds[1]));
+      if (cursor != null) return show(Math.min(Math.max(event.x, 0), figure.x_range.bounds[1]), cursor);
       let best = Infinity, when = null;
       for (const { whole } of runs) {
         for (let i = 0; i < whole.x.length; i++) {
@@ -48,7 +49,7 @@
           if (away < best) [best, when] = [away, whole.t[i]];
         }
       }
-      if (when != null) show(when);
+      if (when != null) show(when, shared);
     };
     figure.on_event("mousemove", move);
     figure.on_event("tap", move);
@@ -64,7 +65,7 @@
     }
   };
   let waiting = null;
-  time.on_change([time.properties.start, time.properties.end], () => {
+  if (runs.length > 0) time.on_change([time.properties.start, time.properties.end], () => {
     clearTimeout(waiting);
     waiting = setTimeout(cut, 60);
   });

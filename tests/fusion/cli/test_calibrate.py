@@ -42,7 +42,10 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
     assert load_soil(out / "soil.yaml").resistance.rolling == rolling
     page = (out / "report.html").read_text()
     assert "Twin against log" in page
-    assert page.count("<figure>") == 3
+    assert "<strong>2 of 3 parameters are identified</strong>" in page
+    assert "vehicle.body.cg_height_m is not identified by this data" in page
+    assert page.count("<figure>") == 2 + len({c["channel"] for c in found["channels"]})
+    assert "default-src 'none'" in page  # the browser itself refuses any request
 
 
 def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:

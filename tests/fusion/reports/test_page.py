@@ -8,25 +8,30 @@ from typing import Any
 import pytest
 from jinja2 import UndefinedError
 
-from terrafusion.fusion.reports.page import write_page
+from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page
 
 HOSTILE = "<script>alert('x')</script>"
 
 
 def sweep_page(path: Path, **values: Any) -> Path:
-    given = {"lead": HOSTILE, "outcome": [((HOSTILE, HOSTILE), "1", "100 %")], "statistics": []} | values
+    given = {
+        "lead": HOSTILE,
+        "verdicts": [VerdictBox("good", HOSTILE, [HOSTILE])],
+        "tiles": [Tile(HOSTILE, HOSTILE, HOSTILE)],
+        "statistics": [],
+    } | values
     provenance = {HOSTILE: HOSTILE}
     return write_page(path, "sweep.html.j2", HOSTILE, provenance=provenance, failures=[HOSTILE], **given)
 
 
 def test_every_value_is_escaped_and_the_style_sheet_is_not(tmp_path: Path) -> None:
-    text = sweep_page(tmp_path / "r.html", figures=[]).read_text(encoding="utf-8")
+    text = sweep_page(tmp_path / "r.html", groups=[]).read_text(encoding="utf-8")
     assert "<script" not in text
-    assert text.count("&lt;script&gt;") == 8
+    assert text.count("&lt;script&gt;") == 11
     assert 'font: 16px/1.55 system-ui, "Segoe UI"' in text
 
 
 def test_a_missing_value_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(UndefinedError, match="figures"):
+    with pytest.raises(UndefinedError, match="groups"):
         sweep_page(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []

@@ -242,6 +242,7 @@ def test_lines_stand_out_on_a_light_and_on_a_dark_page():
         return float(linear @ [0.2126, 0.7152, 0.0722])
 
     lines = [*style.MODE_COLOURS.values(), *style.AXIS_COLOURS, style.HELD_OUT, style.TRUTH_ON_ANY]
+    lines += [style.line_colour(colour) for colour in style.TERRAIN_COLOURS.values()]
     lines += [
         style.SENSOR_COLOURS[name] for name in ("gnss", "gnss_velocity", "wheels", "slip", "gyro", "accel")
     ]
