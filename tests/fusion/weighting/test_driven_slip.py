@@ -81,3 +81,15 @@ def test_learned_slip_survives_a_dump(robot: str) -> None:
         one._reweight(0)
     assert restored.noise == weights.noise
     assert restored.noise.slip_mean != Estimator(config).weights.noise.slip_mean
+
+
+def test_mean_and_spread_are_those_of_the_conjugate_prior() -> None:
+    """Two windows that count for one observation each, beside two of the prior's mean, four of its spread."""
+    found, sigma = DrivenSlip(POLICY), PRIOR_SIGMA[SAND]
+    for off in (0.03, 0.09):  # as badly measured as the prior is wide: half counts
+        found.add(ON_SAND, PRIOR[SAND] + off, sigma, 0.0, 4.0 * TIME_S[SAND])
+    mean, spread = (values[SAND] for values in found.posterior())
+    assert mean == pytest.approx(PRIOR[SAND] + 0.06 * 2.0 / 4.0)
+    square = 2.0 * 0.03**2 + 0.06**2 * 2.0 * 2.0 / 4.0
+    variance = (4.0 * sigma**2 / 1.5 + square) / (4.0 + 2.0) * (1.0 + 1.0 / 4.0)
+    assert spread == pytest.approx(np.sqrt(variance))

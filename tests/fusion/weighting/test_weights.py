@@ -70,6 +70,23 @@ def test_unweighted_measurements_keep_their_sigma() -> None:
     assert plain.wheels(0, wheels, 9.0, 1.0, 0.1) is wheels
     assert plain.gnss(surprise([9.0, 9.0], 0.0, 1.0)) == (1.0, 1.0)
     assert plain.passed_nis == 0.0
+    plain_test = surprise([1.0], 0.0, 1.0)
+    assert (plain_test.drift_m2, plain_test.white_share) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(("ratio", "recorded"), [(1.09, 0), (1.11, 1), (0.91, 0), (0.89, 1)])
+def test_a_change_is_recorded_from_a_tenth_on(ratio: float, recorded: int) -> None:
+    mode, recorder = weighting("innovation", innovation_method="sage_husa")
+    sigma = recorder.noise.wheel_sigma_mps
+    counter_m2 = 0.02**2 - (0.1 * sigma) ** 2
+    nu2 = counter_m2 + 0.01 * sigma**2 * (1.0 + 100.0 * (ratio**2 - 1.0))
+    before, mode_nu = recorder.noise, math.sqrt(max(nu2, 0.0))
+    if nu2 < 0.0:  # a decrease beyond one step: the prediction's variance takes the rest
+        mode.wheels(3, increment(), 0.0, 0.02**2 - nu2, 0.1)
+    else:
+        mode.wheels(3, increment(), mode_nu, 0.02**2, 0.1)
+    assert recorder.noise.wheel_sigma_mps == pytest.approx(ratio * before.wheel_sigma_mps)
+    assert len(recorder.changes) == recorded
 
 
 def test_sage_husa_moves_by_its_gain_towards_what_an_innovation_shows() -> None:
@@ -152,9 +169,12 @@ def test_fixes_are_inflated_by_what_their_innovations_show(drift: float, least: 
     assert recorder.noise.gnss_inflation == pytest.approx(math.sqrt(now))
     white = [max(reported - drift, least * reported) for reported in (now, before**2)]
     assert (scale, weight) == (pytest.approx(math.sqrt(white[0] / white[1])), 1.0)
-    mode.gnss(fix)
+    scale, _ = mode.gnss(fix)
     again = min(max(value + (9.0 - value) / 150.0, low), high)
-    assert recorder.noise.gnss_inflation == pytest.approx(math.sqrt(min(again + drift, again / least)))
+    then = min(again + drift, again / least)
+    assert recorder.noise.gnss_inflation == pytest.approx(math.sqrt(then))
+    white = [max(reported - drift, least * reported) for reported in (then, now)]
+    assert scale == pytest.approx(math.sqrt(white[0] / white[1]))
 
 
 def test_the_inflation_of_fixes_has_bounds() -> None:
@@ -164,6 +184,11 @@ def test_the_inflation_of_fixes_has_bounds() -> None:
         for _ in range(3000):
             mode.gnss(surprise([nu, nu], 0.0, 1.0))
         assert recorder.noise.gnss_inflation == pytest.approx(bound * tuned)
+    for _ in range(3):  # from the bound, not from where they would have been without it
+        mode.gnss(surprise([1e3, 1e3], 0.0, 1.0))
+    assert recorder.noise.gnss_inflation > 50.0 * tuned * 0.999
+    mode.gnss(surprise([0.0, 0.0], 0.0, 1.0))
+    assert recorder.noise.gnss_inflation == pytest.approx(50.0 * tuned * math.sqrt(1.0 - 1.0 / 150.0))
 
 
 def test_cauchy_weights_settle_where_the_update_leaves_their_residual() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,7 @@ def test_products_in_the_metric_are_those_by_the_whole_covariance(weight: np.nda
     m = metric([products for _, products in made], weight, SIGMA, ROBOT)
     np.testing.assert_allclose(m.K[:-1, :-1], all_.T @ inverse @ all_, atol=1e-8)
     assert not m.K[m.none].any()
+    assert m.K[m.error, m.error] == pytest.approx(e @ inverse @ e)
 
 
 def test_what_states_and_robot_explain_is_no_energy() -> None:
@@ -66,3 +69,41 @@ def test_states_are_fitted_to_what_signatures_and_the_robot_leave() -> None:
     _, products = run(5, X[:, :T] @ states + X[:, T:-1] @ (used + shared))
     np.testing.assert_allclose(products.fitted_states(used, np.full(T, 1e4), ROBOT), states, atol=1e-6)
     assert abs(products.fitted_states(used, np.full(T, 1e-3), ROBOT)).max() < 1e-3
+
+
+def test_priors_hold_states_and_robot_where_energy_is_counted() -> None:
+    """Against least squares with the priors as rows; the second channel counts for a quarter."""
+    X, products = run(6)
+    used, weight = np.array([0.3, -0.4]), np.array([1.0, 0.25])
+    offsets = ROBOT.covariance + np.diag(ROBOT.scatter)
+    rows = np.sqrt(np.repeat(weight, N))[:, None]
+    left = X[:, -1] - X[:, T + P : -1] @ used - X[:, T : T + P] @ ROBOT.mean
+    prior = np.zeros((T + P, T + P))
+    prior[:T, :T], prior[T:, T:] = np.diag(1.0 / SIGMA), np.linalg.cholesky(np.linalg.inv(offsets)).T
+    A = np.vstack([rows * X[:, : T + P], prior])
+    best = np.linalg.lstsq(A, np.concatenate([rows[:, 0] * left, np.zeros(T + P)]), rcond=None)[0]
+    square = (left - X[:, : T + P] @ best) ** 2
+    found = energies(products, used, weight, SIGMA, ROBOT)
+    np.testing.assert_allclose(found, [square[: N[0]].mean(), square[N[0] :].mean()])
+
+
+def test_states_are_held_by_their_prior() -> None:
+    X, products = run(5)
+    used = np.array([0.2, -0.1, 0.3, 1.5, -2.0])
+    left = X[:, -1] - X[:, T:-1] @ (used + np.concatenate([ROBOT.mean, np.zeros(Q)]))
+    J, sigma = X[:, :T], np.array([0.05, 0.2])
+    wanted = np.linalg.solve(J.T @ J + np.diag(1.0 / sigma**2), J.T @ left)
+    np.testing.assert_allclose(products.fitted_states(used, sigma, ROBOT), wanted)
+
+
+def test_products_are_kept_by_channel() -> None:
+    X, products = run(7)
+    whitened = SimpleNamespace(
+        rows=np.delete(X, [T + P, T + P + 1], axis=1),
+        channel=np.repeat([0, 1], N),
+        limit=np.ones(2),
+        states=T,
+    )
+    found = Products.of(whitened, X[:, T + P : T + P + Q])  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.gram, products.gram)
+    assert (found.states, found.shared, found.samples.tolist()) == (T, P, list(N))

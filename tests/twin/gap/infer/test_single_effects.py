@@ -120,3 +120,60 @@ def test_a_law_that_must_be_simulated_and_is_not_explains_nothing() -> None:
     fit = laws.fit(m, (dropout,))
     assert fit.evidence == -np.inf or fit.gain == 0.0
     assert isinstance(fit.laws[0], Hypothesis)
+
+
+def test_a_size_beyond_the_simulated_ones_is_the_last_of_them() -> None:
+    columns, signatures = problem(1)
+    m, laws = metric_of(columns, signatures, 5.0 / 3.0 * signatures[:, 1])
+    assert laws.fit(m, (law("encoder_scale", "in_loop"),)).values[0][0] == pytest.approx(3.0)
+
+
+def expected_share(information: np.ndarray, k: int, sides: float, size: float, largest: float) -> float:
+    """Log of the prior's density at a size, which is uniform in the logarithm above .1, times the posterior's
+    volume: over both sides of one size, over the circle of two."""
+    volume = 0.5 * k * np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(information + RIDGE * np.eye(k))[1]
+    area = sides * size if k == 1 else 2.0 * np.pi * size**2
+    return float(volume - np.log(area * np.log(largest / 0.1)))
+
+
+@pytest.mark.parametrize(
+    ("effect", "form", "sides", "true"),
+    [
+        ("gyro_scale", "scale", 2.0, [0.5]),
+        ("gyro_scale", "scale", 2.0, [0.02]),  # as small as sizes are thought to be: .1
+        ("accel_bias", "constant", 1.0, [0.6, 0.8]),
+    ],
+)
+def test_evidence_is_the_likelihood_times_the_share_of_the_prior(
+    effect: str, form: str, sides: float, true: list[float]
+) -> None:
+    candidates = Candidates.of([effect])
+    i = next(i for i, h in enumerate(candidates.hypotheses) if h.form == form)
+    at = list(candidates.hypotheses[i].columns)
+    columns = np.random.default_rng(8).standard_normal((ROWS, len(candidates.keys)))
+    error = columns[:, at] @ true
+    X = np.column_stack([columns, error])
+    m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
+    fit = Laws.of(candidates, {}, m.shared, m.none).fit(m, (i,))
+    np.testing.assert_allclose(fit.values[0], true, rtol=1e-4)
+    H = columns[:, at].T @ columns[:, at]
+    largest = max(1.0, *np.abs(candidates.bounds(tuple(at))).ravel())
+    share = expected_share(H, len(at), sides, max(float(np.linalg.norm(true)), 0.1), largest)
+    assert fit.evidence - fit.gain == pytest.approx(share, abs=1e-3)
+    np.testing.assert_allclose(fit.covariance[0], np.linalg.inv(H + RIDGE * np.eye(len(at))), rtol=1e-6)
+
+
+def test_each_law_of_a_pair_has_its_own_part_of_the_covariance() -> None:
+    candidates = Candidates.of(["accel_bias", "gyro_scale"])
+    pair = [
+        next(i for i, h in enumerate(candidates.hypotheses) if h.form == form)
+        for form in ("constant", "scale")
+    ]
+    columns = np.random.default_rng(8).standard_normal((ROWS, len(candidates.keys)))
+    at = [c for i in pair for c in candidates.hypotheses[i].columns]
+    X = np.column_stack([columns, columns[:, at] @ (0.6, 0.8, 0.5)])
+    m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
+    fit = Laws.of(candidates, {}, m.shared, m.none).fit(m, pair)
+    P = np.linalg.inv(columns[:, at].T @ columns[:, at] + RIDGE * np.eye(3))
+    np.testing.assert_allclose(fit.covariance[0], P[:2, :2])
+    np.testing.assert_allclose(fit.covariance[1], P[2:, 2:])
