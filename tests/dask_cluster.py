@@ -54,3 +54,9 @@ def wait_for_workers(address: str, count: int) -> None:
 
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(count, timeout=PATIENCE_S)
+
+
+def slow_square(number: int) -> int:
+    """A trial that takes a moment, for workers that are to be killed meanwhile."""
+    time.sleep(0.15)
+    return number * number

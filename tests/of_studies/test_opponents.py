@@ -12,7 +12,8 @@ import pytest
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from tests.studies.opponents import ekf, estimators, ours, parts
+from tests.studies import parts
+from tests.studies.opponents import ekf, estimators, ours
 from tests.studies.opponents.drives import RECEIVERS, as_unknown, made, vehicle_of
 from tests.studies.opponents.inertial import GRAVITY_MPS2, Inertial
 from tests.studies.opponents.page import Cell, compared, markdown
@@ -140,8 +141,8 @@ def test_terrafusion_is_scored_on_the_same_outages(drive: Recording) -> None:
 
 def test_parts_are_computed_once(tmp_path: Path) -> None:
     tasks = [parts.Task(f"task {k}", "code", k) for k in range(3)]
-    parts.run_all(tasks[:2], lambda k: k * k, tmp_path, 1, 60.0)
-    parts.run_all(tasks, lambda k: -k, tmp_path, 1, 60.0)
+    parts.run_all(tasks[:2], lambda k: k * k, tmp_path, parts.TaskWorkers())
+    parts.run_all(tasks, lambda k: -k, tmp_path, parts.TaskWorkers())
     assert [parts.result_of(task, tmp_path) for task in tasks] == [0, 1, -2]
     assert parts.result_of(parts.Task("task 0", "other code", 0), tmp_path) is None
 

@@ -2,6 +2,7 @@
 
     python -m tests.studies list                  what there is, and what has been run
     python -m tests.studies run NAME... | --all   run; a study that has a result of this code is skipped
+                  [--backend dask --address ...]  trials on a cluster, of the studies that have many
     python -m tests.studies figures [--write]     do README and docs quote what the results hold?
 
 A result is `results/NAME.json` (figures, command, commit, time), `results/NAME.md` (what was printed) and,
@@ -19,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.studies.figures import differences, documents, rewritten
@@ -27,6 +29,7 @@ from tests.studies.study import DATA, OUT, Study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"
+WORKERS = ("jobs", "backend", "address")
 
 
 def code_of(study: Study) -> str:
@@ -38,7 +41,14 @@ def code_of(study: Study) -> str:
     return done.stdout.strip() or "unknown"
 
 
-def run(study: Study, work: Path, again: bool) -> bool:
+def spread(study: Study, workers: Sequence[str]) -> list[str]:
+    """The words about workers, for a study that takes them; another says that it does not."""
+    if workers and not study.spread:
+        print(f"{study.name}: runs in one process of this machine")
+    return [*workers] if study.spread else []
+
+
+def run(study: Study, work: Path, again: bool, workers: Sequence[str] = ()) -> bool:
     """Run one study and keep its result; False where it failed."""
     file = RESULTS / f"{study.name}.json"
     if file.is_file() and not again and json.loads(file.read_text())["commit"] == code_of(study):
@@ -53,6 +63,7 @@ def run(study: Study, work: Path, again: bool) -> bool:
     words = [word.replace(OUT, str(out)).replace(DATA, data) for word in study.command]
     if words[0] == "terrafusion":
         words[0:1] = ["-c", "from terrafusion.fusion.cli.main import main; main()"]
+    words += spread(study, workers)
     print(f"{study.name}: about {study.minutes:g} min ...", flush=True)
     begun = time.monotonic()
     done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
@@ -133,6 +144,8 @@ def main() -> int:
     running.add_argument("--all", action="store_true", help="every study, the quickest first")
     running.add_argument("--again", action="store_true", help="also what has a result of this code")
     running.add_argument("--work", type=Path, default=ROOT / "studies-work", help="folder for parts")
+    for name in WORKERS:
+        running.add_argument(f"--{name}", help="of studies with many trials, see `terrafusion sweep --help`")
     verbs.add_parser("figures").add_argument("--write", action="store_true")
     given = parser.parse_args()
     if given.verb == "list":
@@ -146,7 +159,8 @@ def main() -> int:
     chosen = sorted(STUDIES, key=lambda s: s.minutes) if given.all else [known[n] for n in given.names]
     if not chosen:
         parser.error("name a study, or give --all")
-    failed = [study.name for study in chosen if not run(study, given.work.absolute(), given.again)]
+    workers = [word for name in WORKERS if (value := getattr(given, name)) for word in (f"--{name}", value)]
+    failed = [s.name for s in chosen if not run(s, given.work.absolute(), given.again, workers)]
     return int(bool(failed))
 
 

@@ -14,6 +14,8 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
+from tests.studies.parts import add_options, answers
 
 SOILS = ("asphalt", "loose_sand", "medium_sand", "mud")
 DRIVES = ("figure_eight", "chirp", "staircase", "circle")
@@ -100,6 +103,15 @@ def outcomes(case: Case, names: Sequence[str] = tuple(SPREAD)) -> list[Outcome]:
     return out
 
 
+def answer(case: tuple[int, int]) -> list[dict[str, Any]] | str:
+    """The outcomes of the case of a number and a seed, or why it failed."""
+    drawn = Case.drawn(*case)
+    try:
+        return [dataclasses.asdict(one) for one in outcomes(drawn)]
+    except TerrafusionError as error:
+        return f"case {drawn.number} ({drawn.soil}, {drawn.drive}): {error}"
+
+
 def interval(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share (Clopper and Pearson 1934)."""
     from scipy.stats import beta
@@ -143,21 +155,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--verbose", action="store_true", help="one line a case")
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args(arguments)
-    found: list[Outcome] = []
-    failed, begun = 0, time.perf_counter()
-    for number in range(given.first, given.first + given.cases):
-        case = Case.drawn(number, given.seed)
-        try:
-            mine = outcomes(case)
-        except TerrafusionError as error:
-            failed += 1
-            print(f"case {number} ({case.soil}, {case.drive}): {error}", file=sys.stderr)
-            continue
-        found += mine
-        if given.verbose:
-            scores = " ".join(f"{o.score:6.2f}{'' if o.status == IDENTIFIED else '*'}" for o in mine)
-            print(f"{number:4d} {case.soil:12s} {case.drive:13s} {scores}", flush=True)
+    begun = time.perf_counter()
+    cases = [(number, given.seed) for number in range(given.first, given.first + given.cases)]
+    told = answers(cases, answer, given, given.out)
+    found = [Outcome(**row) for one in told if isinstance(one, list) for row in one]
+    failed = sum(isinstance(one, str) for one in told)
+    for one in told:
+        if isinstance(one, str):
+            print(one, file=sys.stderr)
+        elif given.verbose:
+            scores = " ".join(f"{o['score']:6.2f}{'' if o['status'] == IDENTIFIED else '*'}" for o in one)
+            print(f"{one[0]['case']:4d} {scores}")
     seconds = time.perf_counter() - begun
     print(f"seed {given.seed}, {given.cases} cases of {SECONDS:g} s, {failed} failed, {seconds:.0f} s")
     for line in table(found):
@@ -165,4 +176,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import coverage
+
+    coverage.main()  # workers know the cases by the module's own name

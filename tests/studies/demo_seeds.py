@@ -7,6 +7,7 @@ interval (bootstrap over seeds).
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -15,6 +16,7 @@ from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import add_options, answers
 
 DRIVES = {
     "demo": ((75.0, 60.0), {}),
@@ -28,8 +30,9 @@ MODES = ("fixed", "adaptive")
 DRAWS = 4000
 
 
-def errors_m(scenario: str, mode: str, seed: int) -> tuple[float, float, float]:
-    """Error of the whole drive (RMS), median in the outage, and at its end, m."""
+def errors_m(trial: tuple[str, str, int]) -> tuple[float, float, float]:
+    """Error of the whole drive (RMS), median in the outage, and at its end, m: scenario, mode and seed."""
+    scenario, mode, seed = trial
     outage, options = DRIVES[scenario]
     log = simulate(scenario, seed=seed, **options)
     scores = replay(log, mode=mode, outages=[Outage(*outage)], findings=()).scores
@@ -53,12 +56,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--drive", choices=tuple(DRIVES), action="append", help="this one alone")
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args()
     print(f"{'drive':14s} {'mode':9s} whole drive, m   median in outage, m   end of outage, m   drives won")
+    seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
     for scenario in given.drive or DRIVES:
-        found = {
-            mode: [errors_m(scenario, mode, FIRST_SEED + i) for i in range(given.seeds)] for mode in MODES
-        }
+        trials = [(scenario, mode, seed) for mode in MODES for seed in seeds]
+        errors = answers(trials, errors_m, given, given.out)
+        found = {mode: errors[i * given.seeds :][: given.seeds] for i, mode in enumerate(MODES)}
         for mode in MODES:
             whole, inside, end = (median(column) for column in zip(*found[mode], strict=True))
             other = found[MODES[1 - MODES.index(mode)]]
@@ -71,4 +77,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import demo_seeds
+
+    demo_seeds.main()  # workers know the trials by the module's own name

@@ -8,7 +8,7 @@ ESTIMATOR = (
     Study(
         "demo_seeds",
         "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",
-        module("demo_seeds", "--seeds", "10"),
+        module("demo_seeds", "--seeds", "10", "--out", OUT),
         12,
         {
             f"{drive}_{mode}_{what}": rf"{drive} +{mode}" + r" +[\d.]+" * i + r" +([\d.]+)"
@@ -20,13 +20,15 @@ ESTIMATOR = (
             f"{drive}_ratio": rf"{drive}, adaptive over fixed at the end: ([\d.]+ \[[\d.]+, [\d.]+\])"
             for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
         },
+        spread=True,
     ),
     Study(
         "outage_causes",
         "What makes the error at the end of the demo's outage, and of mixed ground in the benchmark?",
-        module("outage_causes", "--arms", "fixed;adaptive"),
+        module("outage_causes", "--arms", "fixed;adaptive", "--out", OUT),
         8,
         {f"{f}_ratio": rf"{f} adaptive +[\d.]+ +([\d.]+ \[[\d.]+, [\d.]+\])" for f in ("demo", "mixed")},
+        spread=True,
     ),
     Study(
         "estimator_speed",
@@ -63,6 +65,7 @@ ESTIMATOR = (
         module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
         240,
         picture="field_table.png",
+        spread=True,
     ),
     Study(
         "opponents",
@@ -81,6 +84,7 @@ ESTIMATOR = (
             "lost_to_ekf": r"adaptive / EKF, vehicle of the log: .*lost (\d+ of \d+)",
         },
         "opponents.png",
+        spread=True,
     ),
     Study(
         "unseen_robots",
@@ -105,6 +109,7 @@ ESTIMATOR = (
             f"{number}_held": rf"{number}: within 2 sigma (\d+ of \d+)"
             for number in ("antenna_x_m", "gnss_delay_s", "imu_yaw_rad", "wheel_scale")
         },
+        spread=True,
     ),
     Study(
         "coarse_slides",
@@ -195,6 +200,7 @@ ESTIMATOR = (
         240,
         {"ratio": r"all changes, not told: ([\d.]+)"},
         "known_changes.png",
+        spread=True,
     ),
     Study(
         "benchmark",
@@ -206,6 +212,7 @@ ESTIMATOR = (
             for family, plant in (("mixed", "twin"), ("mixed", "second"), ("unseen", "second"))
         },
         picture="ratios.png",
+        spread=True,
     ),
     Study(
         "detector",

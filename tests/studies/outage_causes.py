@@ -16,6 +16,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from terrafusion.fusion.replay import replay
 from terrafusion.fusion.training.simulated_runs import wheel_samples
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import add_options, answers
 
 DEMO_OUTAGE = Outage(75.0, 60.0)
 DEVELOP = {"demo": range(1000, 1020), "mixed": range(100_000, 100_010)}
@@ -207,6 +209,17 @@ def replayed(log: Recording, outage: Outage, mode: str, known: Known | None, set
         ).estimate
 
 
+def causes(drive: tuple[str, int, str | None]) -> dict[str, Any]:
+    """The terms of one drive by arm: family, seed, and the arms that are wanted."""
+    family, seed, wanted = drive
+    log, outage = drive_of(family, seed)
+    return {
+        arm: terms(log, replayed(log, outage, mode, known, settings), outage).tolist()
+        for arm, (mode, known, settings) in arms_of(log, outage).items()
+        if wanted is None or arm in wanted.split(";")
+    }
+
+
 def ratio(errors: Array, fixed: Array) -> str:
     """Geometric mean of the ratio and its 95 % interval over drives."""
     logs = np.log(errors / fixed)
@@ -235,21 +248,22 @@ def main() -> int:
     parser.add_argument("--family", choices=tuple(JUDGE), help="this one alone")
     parser.add_argument("--arms", help="those that begin with one of these words, by commas")
     parser.add_argument("--drives", type=int, default=1000)
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args()
     for family, seeds in (DEVELOP if given.develop else JUDGE).items():
         if given.family not in (None, family):
             continue
         found: dict[str, list[Array]] = {}
-        for seed in list(seeds)[: given.drives]:
-            log, outage = drive_of(family, seed)
-            for arm, (mode, known, settings) in arms_of(log, outage).items():
-                if given.arms is None or arm in given.arms.split(";"):
-                    found.setdefault(arm, []).append(
-                        terms(log, replayed(log, outage, mode, known, settings), outage)
-                    )
+        drives = [(family, seed, given.arms) for seed in list(seeds)[: given.drives]]
+        for answer in answers(drives, causes, given, given.out):
+            for arm, rows in answer.items():
+                found.setdefault(arm, []).append(np.array(rows))
         report(family, found)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    from tests.studies import outage_causes
+
+    raise SystemExit(outage_causes.main())  # workers know the drives by the module's own name

@@ -21,6 +21,7 @@ class Study:
         figures: name -> regular expression with one group; it is searched in what the command prints, line
             by line from its beginning.
         picture: file that the command leaves in its folder, if it draws one.
+        spread: whether its trials run in many processes or on a cluster (--jobs, --backend, --address).
     """
 
     name: str
@@ -29,6 +30,7 @@ class Study:
     minutes: float
     figures: dict[str, str] = field(default_factory=dict)
     picture: str = ""
+    spread: bool = False
 
     def needs_logs(self) -> bool:
         """Whether it reads public field logs."""

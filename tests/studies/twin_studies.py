@@ -54,9 +54,10 @@ TWIN = (
     Study(
         "coverage",
         "Do two sigma of `calibrate` hold the true number?",
-        module("coverage"),
+        module("coverage", "--out", OUT),
         15,
         {"within_2_sigma_percent": r"all +\d+ +([\d.]+) %"},
+        spread=True,
     ),
     Study(
         "single_wheel",
@@ -87,6 +88,7 @@ TWIN = (
             "partly": r".*?(\d+) partly",
             "disagree": r".*?(\d+) disagree",
         },
+        spread=True,
     ),
     Study(
         "effect_sweep",
@@ -129,6 +131,7 @@ TWIN = (
             **{key: rf"{name} {{2,}}((?:\S+ )*?\S+)(?: {{2,}}|$)" for key, name in BLIND_FIGURES.items()},
         },
         "sheet.png",
+        spread=True,
     ),
     Study(
         "blind_plant",

@@ -46,7 +46,9 @@ from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.executors import open_workers
+from tests.studies.parts import TaskWorkers, add_options
 
+ONE = TaskWorkers()
 FIRST_MODES = ("adaptive", "fixed")
 """Run on every log before the other modes: a table that was stopped compares these two everywhere."""
 
@@ -126,24 +128,28 @@ def tasks_of(
 
 
 def run_tasks(
-    tasks: Sequence[Task], out: Path, *, jobs: int = 1, progress: Callable[[str], None] = lambda _: None
-) -> None:
+    tasks: Sequence[Task], out: Path, *, workers: TaskWorkers = ONE,
+    progress: Callable[[str], None] = lambda _: None,
+) -> None:  # fmt: skip
     """Run the tasks of which `out` does not hold the results yet, and keep them there.
 
     Args:
-        jobs: processes; times are then those of loaded processors.
+        workers: with several, times are those of loaded processors.
 
     Raises:
         TerrafusionError: workers died, or the folder cannot be written.
     """
     check_folder(out / FOLDER)
     missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
-    with open_workers("loky", min(jobs, max(len(missing), 1))) as workers:
-        for task, found in workers.results(run_task, [(task,) for task in missing]):
+    begun, jobs = time.monotonic(), min(workers.jobs, max(len(missing), 1))
+    with open_workers(workers.backend, jobs, workers.address) as opened:
+        for task, found in opened.results(run_task, [(task,) for task in missing]):
             runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
             refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]
             write_part(out, task.key, {"runs": runs, "refused": refused}, log_state(task.log))
             progress(f"{task.log}, {task.mode}")
+            if time.monotonic() - begun > workers.limit_s:
+                break
 
 
 def collect(tasks: Sequence[Task], out: Path) -> tuple[list[Run], list[Refusal], list[Task]]:
@@ -262,7 +268,7 @@ def main() -> int:
     parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
     parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
     parser.add_argument("--seeds", type=int, default=1, help="how many draws of that noise, from --seed on")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_options(parser)
     parser.add_argument("--collect", action="store_true", help="run nothing, write what has been run")
     words = parser.parse_args()
     if words.seeds < 1:
@@ -270,15 +276,15 @@ def main() -> int:
     logs = list(words.logs) if words.logs else catalogued()
     tasks = tasks_of(logs, words.modes, words.starts, words.seed, words.seeds)
     try:
-        _table(words.out, tasks, None if words.collect else words.jobs)
+        _table(words.out, tasks, None if words.collect else TaskWorkers.of(words))
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _table(out: Path, tasks: Sequence[Task], jobs: int | None) -> None:
-    """Run what is missing, unless `jobs` is None, and write the tables of what is there."""
+def _table(out: Path, tasks: Sequence[Task], workers: TaskWorkers | None) -> None:
+    """Run what is missing, unless `workers` is None, and write the tables of what is there."""
     from tests.studies.field_table.page import write
 
     if not tasks:
@@ -291,8 +297,8 @@ def _table(out: Path, tasks: Sequence[Task], jobs: int | None) -> None:
         if sys.stderr.isatty():
             print(f"\r\x1b[K{time.monotonic() - begun:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
 
-    if jobs is not None:
-        run_tasks(tasks, out, jobs=jobs, progress=progress)
+    if workers is not None:
+        run_tasks(tasks, out, workers=workers, progress=progress)
     progress("")
     runs, refusals, missing = collect(tasks, out)
     print(write(out, runs, refusals))

@@ -11,6 +11,7 @@ Results are kept one by one: the same command goes on where it was stopped.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,8 +24,8 @@ from tests.studies.known_changes.page import BEFORE, Found, markdown, picture
 from tests.studies.opponents import ours
 from tests.studies.opponents.command import further_logs, missing, parser_of, prepared, store
 from tests.studies.opponents.drives import Drive, default_logs, vehicle_of
-from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 from tests.studies.opponents.protocol import Streams, streams_of
+from tests.studies.parts import Task, TaskWorkers, code_of, library_code, result_of, run_all
 
 HERE = Path(__file__).parent
 MODE = "adaptive"
@@ -114,11 +115,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the outages")
     parser.add_argument("--most-s", type=float, default=3600.0, help="longer logs are cut")
     given = parser.parse_args()
-    load([*(given.logs or default_logs()), *further_logs()], given.runs, given.most_s)
+    names = [*(given.logs or default_logs()), *further_logs()]
+    load(names, given.runs, given.most_s)
     if not _DRIVES:
         parser.exit(1, "error: no log can be scored; set TERRAFUSION_DATA\n")
     tasks, parts = tasks_of(given.seconds, given.most_s), given.out / "parts"
-    run_all(tasks, compute, parts, given.jobs, 60.0 * given.minutes)
+    again = functools.partial(load, names, given.runs, given.most_s)
+    run_all(tasks, compute, parts, TaskWorkers.of(given), again)
     found, notes = found_in(tasks, parts)
     text = markdown(found, notes, missing(tasks, parts), len(tasks))
     store(given.out, "known_changes", text, picture(found))

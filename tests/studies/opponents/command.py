@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from tests.studies.opponents.drives import Drive, drives_of, longest
-from tests.studies.opponents.parts import Task, result_of
+from tests.studies.parts import Task, add_options, result_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,10 +31,7 @@ def parser_of(module: str, description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, required=True, help="folder for parts, tables and figure")
     parser.add_argument("--logs", nargs="+", metavar="LOG", help="by default all at hand")
     parser.add_argument("--runs", type=int, default=1, help="of a file with many runs, the longest")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument(
-        "--minutes", type=float, default=600.0, help="stop after this time, with what there is"
-    )
+    add_options(parser)
     return parser
 
 

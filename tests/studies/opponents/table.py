@@ -11,6 +11,7 @@ the catalogue. Results are kept outage by outage: the same command goes on where
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from tests.studies.opponents.command import further_logs, missing, parser_of, pr
 from tests.studies.opponents.drives import Drive, as_unknown, default_logs, vehicle_of
 from tests.studies.opponents.inertial import Inertial
 from tests.studies.opponents.page import Cell, markdown, picture
-from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
+from tests.studies.parts import Task, TaskWorkers, code_of, library_code, result_of, run_all
 
 LENGTHS_S = (30.0, 60.0, 10.0)
 DESCRIBED, UNKNOWN = "vehicle of the log", "wheel radius and track alone"
@@ -105,7 +106,8 @@ def main() -> int:
     parser.add_argument("--seconds", nargs="+", type=float, default=LENGTHS_S)
     parser.add_argument("--only", nargs="+", metavar="ESTIMATOR", help="run these alone")
     given = parser.parse_args()
-    load(given.logs or [*default_logs(), *further_logs()], given.runs)
+    names = given.logs or [*default_logs(), *further_logs()]
+    load(names, given.runs)
     if not _DRIVES:
         parser.exit(1, "error: no log can be scored; set TERRAFUSION_DATA\n")
     tasks, parts = tasks_of(given.seconds), given.out / "parts"
@@ -113,8 +115,8 @@ def main() -> int:
         [t for t in tasks if not given.only or t.what.estimator in given.only],
         compute,
         parts,
-        given.jobs,
-        60.0 * given.minutes,
+        TaskWorkers.of(given),
+        functools.partial(load, names, given.runs),
     )
     cells, failures = cells_of(tasks, parts)
     text = markdown(cells, failures, missing(tasks, parts), len(tasks))

@@ -19,7 +19,7 @@ from terrafusion.fusion.benchmark.outage_plan import until
 from tests.studies.opponents.drives import Drive, default_logs, drives_of, longest, vehicle_of
 from tests.studies.opponents.estimators import TUNED, TUNED_OPPONENTS, grid, noise_of, rows_of
 from tests.studies.opponents.inertial import Inertial
-from tests.studies.opponents.parts import Task, code_of, result_of, run_all
+from tests.studies.parts import Task, TaskWorkers, code_of, result_of, run_all
 
 SPLIT = Path(__file__).with_name("split.json")
 LENGTHS_S = (30.0, 10.0)
@@ -69,7 +69,7 @@ def tune(folder: Path, jobs: int) -> dict[str, dict[str, object]]:
     tasks = [
         Task(f"{name} {values}", code, (name, values)) for name in TUNED_OPPONENTS for values in grid(name)
     ]
-    run_all(tasks, score, folder, jobs, float("inf"))
+    run_all(tasks, score, folder, TaskWorkers(jobs))
     best: dict[str, dict[str, object]] = {}
     for name in TUNED_OPPONENTS:
         scores = sorted(

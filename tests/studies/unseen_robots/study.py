@@ -23,9 +23,9 @@ import numpy as np
 from terrafusion.fusion.api.replays import replay
 from tests.studies.opponents import ekf, ours
 from tests.studies.opponents.drives import vehicle_of
-from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 from tests.studies.opponents.protocol import Row, scored, streams_of
 from tests.studies.opponents.summary import geometric_mean, losses, ratio
+from tests.studies.parts import Task, TaskWorkers, add_options, code_of, library_code, result_of, run_all
 from tests.studies.unseen_robots.draw import Robot, draw
 from tests.studies.unseen_robots.machine import drive
 from tests.studies.unseen_robots.sensors import recording_of
@@ -182,15 +182,14 @@ def main() -> int:
     parser.add_argument("--robots", type=int, default=18)
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--seconds", nargs="+", type=float, default=(10.0, 30.0))
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--minutes", type=float, default=600.0, help="stop after this time")
+    add_options(parser)
     given = parser.parse_args()
     code = library_code() + code_of(
         *(HERE / f"{name}.py" for name in ("draw", "machine", "sensors", "study"))
     )
     seeds = range(given.first_seed, given.first_seed + given.robots)
     tasks = [Task(f"robot {seed} {given.seconds}", code, Work(seed, tuple(given.seconds))) for seed in seeds]
-    run_all(tasks, compute, given.out / "parts", given.jobs, 60.0 * given.minutes)
+    run_all(tasks, compute, given.out / "parts", TaskWorkers.of(given))
     done = [found for task in tasks if (found := result_of(task, given.out / "parts")) is not None]
     print("\n".join(table([Result(**entry) for found in done for entry in found["results"]])))
     print("\n".join(numbers_table([Learned(**entry) for found in done for entry in found["numbers"]])))
