@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import as_vehicle
@@ -139,3 +140,18 @@ def test_the_window_of_the_detector_is_that_of_the_last_second() -> None:
     assert last.yaw_rate_gyro_radps == pytest.approx(rate, rel=0.01)
     assert last.imu_t_s[-1] - last.imu_t_s[0] == pytest.approx(1.0, abs=0.02)
     assert (last.slip, last.slip_sigma) == (None, None)  # no fixes: the slip is what its prior says
+
+
+def test_noise_begins_on_the_level() -> None:
+    weights = noise_of("elevate")
+    weights.begin(0)
+    mean, sigma, *_ = weights.policy.slips()
+    p = np.array(list(weights.posterior().values()))
+    assert weights.noise == weights.policy.blend(p, 0.0, (mean, sigma))
+
+
+def test_grounds_are_learned_only_where_a_memory_is_given() -> None:
+    assert noise_of().learned_grounds() is None
+    memory = noise_of(grounds=GroundMemory()).learned_grounds()
+    assert memory is not None
+    assert len(memory) == 0

@@ -177,3 +177,17 @@ def test_each_law_of_a_pair_has_its_own_part_of_the_covariance() -> None:
     P = np.linalg.inv(columns[:, at].T @ columns[:, at] + RIDGE * np.eye(3))
     np.testing.assert_allclose(fit.covariance[0], P[:2, :2])
     np.testing.assert_allclose(fit.covariance[1], P[2:, 2:])
+
+
+def test_a_simulated_law_of_two_columns_has_one_size() -> None:
+    candidates = Candidates.of(["accel_bias"])
+    both = candidates.hypotheses[0]
+    columns, signatures = np.random.default_rng(2).standard_normal((2, ROWS, len(candidates.keys)))
+    X = np.column_stack([columns, signatures[:, :2], 2.0 * signatures[:, 0]])
+    m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
+    ladders = {both: Ladder(both, np.array([0.0, 1.0, 3.0]), (-1, 0, 1))}
+    laws = Laws.of(candidates, ladders, m.shared, m.none)
+    fit = laws.fit(m, (0,))
+    assert fit.values[0].shape == (2,)
+    assert len(set(fit.values[0])) == len(set(fit.covariance[0].ravel())) == 1
+    assert fit.covariance[0].shape == (2, 2)
