@@ -20,6 +20,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -33,6 +34,7 @@ from tests.datasets.fuzz import cpu_s
 
 ROOT = Path(__file__).parents[2]
 GRAPH = ("tests/fusion/graph/test_chain.py", "tests/fusion/graph/test_batch.py")
+PHYSICS = ("tests/twin/physics/test_wheel.py", "tests/twin/physics/test_terramechanics.py")
 WEIGHTS = ("tests/fusion/weighting/test_weights.py",)
 MODES = "tests/fusion/weighting/test_modes.py::"
 TARGETS = {
@@ -40,8 +42,8 @@ TARGETS = {
     "fusion/graph/gnss_factor.py": GRAPH,
     "fusion/graph/slow_states.py": (*GRAPH, "tests/fusion/graph/test_slow_states.py"),
     "fusion/graph/chain.py": GRAPH,
-    "twin/physics/wheel.py": ("tests/twin/physics",),
-    "twin/physics/terramechanics.py": ("tests/twin/physics",),
+    "twin/physics/wheel.py": PHYSICS,
+    "twin/physics/terramechanics.py": PHYSICS,
     "fusion/metrics/consistency.py": ("tests/fusion/metrics/test_consistency.py",),
     "fusion/metrics/error_series.py": ("tests/fusion/metrics/test_scores.py",),
     "fusion/metrics/scores.py": ("tests/fusion/metrics/test_scores.py",),
@@ -123,11 +125,21 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def outcome(target: str, source: str, tests: Sequence[str]) -> str:
-    """ "killed", "survived" or "hangs" (which is noticed, too)."""
+    """ "killed", "survived" or "hangs" (which is noticed, too).
+
+    A mutated twin is compiled for itself: the cache takes its library for that of the sources on the disk.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        return _outcome(target, source, tests, cache if target.startswith("twin/") else None)
+
+
+def _outcome(target: str, source: str, tests: Sequence[str], cache: str | None) -> str:
     child = os.fork()
     if child == 0:
         status = 70
         try:
+            if cache is not None:
+                os.environ["TERRAFUSION_CACHE"] = cache
             name = "terrafusion." + target.removesuffix(".py").replace("/", ".")
             for loaded in [one for one in sys.modules if one.startswith(("terrafusion.", "tests."))]:
                 del sys.modules[loaded]

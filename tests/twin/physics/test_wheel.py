@@ -13,9 +13,18 @@ from hypothesis import strategies as st
 from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
+from terrafusion.twin.physics import terramechanics as tm
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
 from terrafusion.twin.physics.terramechanics import WheelShape
-from terrafusion.twin.physics.wheel import Contact, WheelSoil, contact, footprint, steady_contact
+from terrafusion.twin.physics.wheel import (
+    RESISTANCE_SPEED_MPS,
+    Contact,
+    WheelSoil,
+    clog_rate,
+    contact,
+    footprint,
+    steady_contact,
+)
 
 LOAD_N = 80.0
 SMOOTH = WheelShape(0.175, 0.145)
@@ -220,3 +229,86 @@ def test_derivatives_are_those_of_finite_differences(name, state, clog, load) ->
         up, down = (np.asarray(function(at + sign * change)[0]).ravel() for sign in (1.0, -1.0))
         close = 1e-3 * (1.0 + np.abs(exact[:, k]).max())
         np.testing.assert_allclose((up - down) / (2.0 * step), exact[:, k], rtol=1e-3, atol=close)
+
+
+def test_a_rolling_wheel_is_braked_by_its_load_and_by_suction_at_their_arms() -> None:
+    """Rolling resistance at the radius, suction on the contact's area at half its length."""
+    on = ground("asphalt", rolling=0.02, suction_pa=0.0)
+    wheel = steady(on, 1.0, (1.0, 0.0))
+    assert wheel.drag_torque_nm == pytest.approx(0.02 * LOAD_N * SMOOTH.radius_m, rel=1e-4)
+    length = float(footprint(on, LOAD_N, 1.0, (1.0, 0.0), 0.0, SMOOTH).length_m)
+    sticky = steady(on._replace(suction_pa=4e3), 1.0, (1.0, 0.0)).drag_torque_nm - wheel.drag_torque_nm
+    assert sticky == pytest.approx(4e3 * SMOOTH.width_m * length * 0.5 * length, rel=1e-4)
+
+
+def test_clogging_brakes_and_sinks_with_its_fourth_power() -> None:
+    on = ground("mud", clog_torque_nm=3.0, clog_sinkage_m=0.01)
+    clean, half, full = (
+        contact(on, LOAD_N, 1.0, (1.0, 0.0), (0.0, 0.0), 0.01, clog, SMOOTH) for clog in (0.0, 0.5, 1.0)
+    )
+    base = on._replace(clog_sinkage_m=0.0)
+    torques = [
+        float(contact(base, LOAD_N, 1.0, (1.0, 0.0), (0.0, 0.0), 0.01, q, SMOOTH).drag_torque_nm)
+        for q in (0.0, 0.5, 1.0)
+    ]
+    assert torques[1] - torques[0] == pytest.approx(3.0 / 16.0)
+    assert torques[2] - torques[0] == pytest.approx(3.0)
+    z = [float(one.sinkage_m) for one in (clean, half, full)]
+    assert z[1] - z[0] == pytest.approx(0.01 / 16.0, rel=1e-3)
+    assert z[2] - z[0] == pytest.approx(0.01, rel=1e-2)
+
+
+def test_mud_is_picked_up_and_shed_with_travel() -> None:
+    """Clean: pickup x travel. In balance pickup (1 + churn q s^2) (1 - q) = shed q. At rest nothing."""
+    on = ground("mud", pickup_per_m=0.3, churn_gain=2.0, shed_per_m=0.1)
+    far = np.hypot(1.0, RESISTANCE_SPEED_MPS) - RESISTANCE_SPEED_MPS
+    assert float(clog_rate(on, 0.0, 1.0, 0.5)) == pytest.approx(0.3 * far)
+    assert float(clog_rate(on, 0.5, -1.0, 0.5)) == pytest.approx((0.3 * 1.25 * 0.5 - 0.05) * far)
+    assert float(clog_rate(on, 1.0, 1.0, 0.9)) == pytest.approx(-0.1 * far)
+    assert float(clog_rate(on, 0.2, 0.0, 1.0)) == 0.0
+
+
+def test_soil_held_at_rest_damps_and_a_rolling_wheel_meets_fresh_soil() -> None:
+    """The shear that pushes is j + c v_s, c .03 s at rest and half of it at .05 m/s."""
+    on = ground("loose_sand", bulldozing=0.0, slip_sinkage=0.0)
+    for transport, damping in ((1e-4, 0.03), (0.05, 0.015)):
+        rim = transport
+        j = 1e-3 + damping * rim
+        moving, same = (
+            contact(on, LOAD_N, r, (0.0, 0.0), (x, 0.0), 0.0, 0.0, SMOOTH) for r, x in ((rim, 1e-3), (0.0, j))
+        )
+        assert float(moving.traction_x_n) == pytest.approx(float(same.traction_x_n), rel=2e-3)
+
+
+def test_a_bristle_deflects_within_a_centimetre_of_travel() -> None:
+    on = ground("asphalt", suction_pa=0.0)
+    at = [contact(on, LOAD_N, 1.0, (1.0, 0.0), (0.0, 0.0), b, 0.0, SMOOTH) for b in (0.0, 0.005, 0.01)]
+    assert [float(one.brake_rate) for one in at] == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
+    torque = [float(one.drag_torque_nm) for one in at]
+    assert torque == pytest.approx([0.0, 0.5 * torque[2], on.rolling * LOAD_N * SMOOTH.radius_m])
+
+
+def test_resistance_opposes_the_path_of_the_hub() -> None:
+    """Compaction and viscous drag, without bulldozing and without shear; at walking pace all of it."""
+    on = ground("loose_sand", bulldozing=0.0, slip_sinkage=0.0, skid_sinkage=0.0, viscous_ns_per_m=7.0)
+    u, v = 0.6, 0.8
+    wheel = contact(on, LOAD_N, 0.6, (u, v), (0.0, 0.025), 0.0, 0.0, SMOOTH)
+    z = float(wheel.sinkage_m)
+    pushed = float(tm.compaction_resistance(on.exponent, LOAD_N, z, SMOOTH.radius_m))
+    drag = pushed / np.hypot(1.0, RESISTANCE_SPEED_MPS) + 7.0
+    assert float(wheel.force_x_n) - float(wheel.traction_x_n) == pytest.approx(-drag * u)
+    assert float(wheel.force_y_n) - float(wheel.traction_y_n) == pytest.approx(-drag * v)
+
+
+def test_traction_is_mohr_coulombs_mobilised_by_janosi_and_hanamotos_shear() -> None:
+    """A long way sheared, far from the cap: c b l + W tan(phi) times the mean of 1 - exp(-j / K)."""
+    on = ground("loose_sand", friction_cap=50.0, slip_sinkage=0.0, bulldozing=0.0)
+    wheel = contact(on, LOAD_N, 0.0, (0.0, 0.0), (0.03, 0.04), 0.0, 0.0, SMOOTH)
+    length = float(footprint(on, LOAD_N, 0.0, (0.0, 0.0), 0.0, SMOOTH).length_m)
+    x = 0.05 / on.shear_modulus_m
+    thrust = on.cohesion_pa * SMOOTH.width_m * length + LOAD_N * on.tan_friction
+    mean = 1.0 - (1.0 - np.exp(-x)) / x
+    pulls = float(wheel.traction_x_n), float(wheel.traction_y_n)
+    assert pulls == pytest.approx((0.6 * thrust * mean, 0.8 * thrust * mean), rel=2e-3)
+    capped = contact(on._replace(friction_cap=0.1), LOAD_N, 0.0, (0.0, 0.0), (0.05, 0.0), 0.0, 0.0, SMOOTH)
+    assert float(capped.traction_x_n) == pytest.approx(0.1 * LOAD_N, rel=0.01)
