@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from terrafusion.fusion.benchmark.estimator_gap import Compared
-from terrafusion.fusion.reports.gap_text import either, numbers, percent, sections, verdict_line
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
+from terrafusion.fusion.reports.gap_text import either, named_sets, numbers, percent, sections, verdict_line
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.verdict import LEAST_PROBABILITY
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
@@ -38,19 +39,44 @@ def write_diagnosis(
     if judged is not None:
         rows = [dataclasses.asdict(score) for score in scores]
         write_text(out / "judge.json", json.dumps(rows, indent=1, allow_nan=False) + "\n")
+    sheet = Sheet()
+    paths = plots.plot_paths(sheet, d, MOST_RUNS) if d.detected else []
+    if d.where:
+        plots.plot_map(sheet, d)
+    if d.detected:
+        plots.plot_causes(sheet, d)
+    plots.plot_shrink(sheet, d)
+    errors = {name: plots.plot_errors(sheet, d, i) for i, name in enumerate(d.runs[:MOST_RUNS])}
     write_page(
         out / "report.html", "gap.html.j2", f"Gap between {d.vehicle} and its twin",
-        lead=verdict_line(d), sections=sections(d), provenance=provenance, packages=TWIN_LIBRARIES,
-        where=_where(d), causes=_causes(d), sets=_sets(d), drives=_drives(d), notes=d.notes,
-        figures={
-            "path": plots.plot_path(d, MOST_RUNS) if d.detected else None,
-            "map": plots.plot_map(d) if d.where else None,
-            "causes": plots.plot_causes(d) if d.detected else None,
-            "shrink": plots.plot_shrink(d),
-        },
-        errors={name: plots.plot_errors(d, i) for i, name in enumerate(d.runs[:MOST_RUNS])},
+        verdicts=[VerdictBox(_value(d), verdict_line(d), ())], tiles=_tiles(d),
+        sections=sections(d), provenance=provenance, packages=TWIN_LIBRARIES, where=_where(d),
+        causes=_causes(d), sets=_sets(d), drives=_drives(d), notes=d.notes, paths=paths, errors=errors,
         estimator_gap=_estimator_gap(scores), failed=[f"left out: {line}" for line in failed],
+        **sheet.parts(),
     )  # fmt: skip
+
+
+def _value(d: GapDiagnosis) -> str:
+    if d.verdict.kind == "unknown":
+        return "not_to_be_used"
+    return "good" if d.verdict.kind == "no_gap" and d.detection.p_value > d.significance else "doubtful"
+
+
+def _tiles(d: GapDiagnosis) -> list[Tile]:
+    """How sure it is that there is a gap, and what a named effect explains of it."""
+    p, limit = d.detection.p_value, d.significance
+    tiles = [Tile("p of no gap", f"{p:.2g}", f"a gap below {limit:g}")]
+    if named := named_sets(d):
+        tiles.append(Tile("certain of the cause", percent(named[0].probability), either(named[0])))
+    elif d.verdict.kind == "unknown":
+        tiles.append(
+            Tile("certain of an unknown cause", percent(d.verdict.p_unknown), "none of the catalogue")
+        )
+    if d.verdict.named and d.shrinkage.share is not None:
+        share = f"{100.0 * d.shrinkage.share:.0f} %"
+        tiles.append(Tile("the gap shrinks by", share, "with the named effect in the twin"))
+    return tiles
 
 
 def _where(d: GapDiagnosis) -> list[list[str]]:

@@ -1,99 +1,97 @@
-"""Plots of a diagnosis: paths, the gap map, ranked causes, errors before and after the effect is added."""
+"""Figures of a diagnosis: paths, the gap map, ranked causes, errors before and after the effect is added."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.sheet import Sheet, name_ticks
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES, regimes
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, CHANNEL_UNITS, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
 MOST_CAUSES = 8
 PLACE_S = 0.5
 """Interval of a path that is drawn as one point."""
-LEAST_SIDE = 0.5
-"""Shorter side of the frame of a path over its longer one."""
-ALIKE = "#9ecae1"
 
 
-def plot_map(d: GapDiagnosis) -> Figure:
+def plot_map(sheet: Sheet, d: GapDiagnosis) -> None:
     """Channel by regime (both bands): share of the excess error; a dot where it is significant."""
+    from bokeh.palettes import Oranges256
+
     channels = list(dict.fromkeys(c.channel for c in d.where))
     columns = [(r, b) for r, _ in REGIMES for b in BANDS]
     share = np.full((len(channels), len(columns)), np.nan)
-    fig, ax = style.canvas((10.0, 2.6 + 0.36 * len(channels)))
-    for cell in d.where:
-        row, column = channels.index(cell.channel), columns.index((cell.regime, cell.band))
-        share[row, column] = 100.0 * cell.share
-        if cell.p_value <= d.significance:
-            ax.plot(column, row, "o", color=style.TRUTH, markersize=4)
-    image = ax.imshow(share, aspect="auto", cmap="Oranges", vmin=0.0)
-    ax.set_yticks(range(len(channels)), channels, fontsize=8)
-    labels = [f"{r}\n{b}" for r, b in columns]
-    ax.set_xticks(range(len(columns)), labels, rotation=55, ha="right", fontsize=7)
-    fig.colorbar(image, ax=ax, label="share of the excess, %")
-    return fig
+    places = np.array([(columns.index((c.regime, c.band)), channels.index(c.channel)) for c in d.where])
+    share[places[:, 1], places[:, 0]] = [100.0 * c.share for c in d.where]
+    plot = sheet.add_rows("cells where", "", channels, x_range=(-0.5, len(columns) - 0.5))
+    fig = plot.panel.figure
+    fig.height += 110
+    palette = Oranges256[::-1][20:]
+    edges = (np.arange(n + 1) - 0.5 for n in (len(columns), len(channels)))
+    plot.cells(*edges, share, palette, limits=(0.0, max(float(np.nanmax(share)), 1.0)))
+    sure = places[[c.p_value <= d.significance for c in d.where]].astype(float)
+    if len(sure):
+        plot.dots(sure[:, 0], sure[:, 1], "significant", "#1a1a1a", size=5.0)
+    name_ticks(fig.xaxis, [f"{r}, {b}" for r, b in columns])
+    fig.xaxis.major_label_orientation = 0.9
 
 
-def plot_causes(d: GapDiagnosis) -> Figure:
-    """Share of the gap that each of the first causes explains by itself; its probability beside it."""
+def plot_causes(sheet: Sheet, d: GapDiagnosis) -> None:
+    """Share of the gap that each of the first causes explains by itself, with its probability."""
     causes = [c for c in d.verdict.causes if c.share is not None][:MOST_CAUSES]
-    fig, ax = style.canvas((8.0, 1.0 + 0.32 * len(causes)))
     alike = {name for s in d.verdict.sets if s.named for name in s.effects}
-    at = np.arange(len(causes))[::-1]
-    shares = [100.0 * float(np.clip(c.share or 0.0, 0.0, 1.0)) for c in causes]
-    colours = [
-        style.AFTER if c.effect in d.verdict.named else ALIKE if c.effect in alike else style.NEUTRAL
-        for c in causes
-    ]
-    ax.barh(at, shares, color=colours, height=0.7)
-    for y, share, c in zip(at, shares, causes, strict=True):
-        ax.text(share + 1.0, y, f"probability {100.0 * c.probability:.1f} %", va="center", fontsize=8)
-    ax.set_yticks(at, [c.effect for c in causes])
-    ax.set_xlim(0.0, 130.0)
-    ax.set_xticks(range(0, 101, 20))
-    style.format_axes(ax, x="share of the gap that it explains by itself, %")
-    return fig
+    names = [f"{c.effect} ({100.0 * c.probability:.0f} %)" for c in causes]
+    x = "share of the gap that it explains by itself, %"
+    plot = sheet.add_rows("rows causes", x, names, x_range=(0.0, 105.0))
+    kinds = ["named" if c.effect in d.verdict.named else "alike" if c.effect in alike else "" for c in causes]
+    for kind, label, colour in (
+        ("named", "named", style.AFTER),
+        ("alike", "cannot be told from a named one", style.MODE_COLOURS["innovation"]),
+        ("", "other", style.NEUTRAL),
+    ):
+        rows = np.flatnonzero(np.array(kinds) == kind).astype(float)
+        if len(rows):
+            share = [100.0 * float(np.clip(causes[int(i)].share or 0.0, 0.0, 1.0)) for i in rows]
+            bars = {"y": rows, "right": np.array(share)}
+            plot.glyph("hbar", bars, label, colour, "area", height=0.6, line_width=0)
 
 
-def plot_path(d: GapDiagnosis, most: int) -> Figure:
-    """Path of each judged run, coloured by the error of the first place's channel, its regime ringed."""
+def plot_paths(sheet: Sheet, d: GapDiagnosis, most: int) -> list[str]:
+    """Path of each judged run, coloured by the error of the first place's channel, its regime ringed.
+
+    Returns:
+        The keys of the figures.
+    """
+    from bokeh.models import ColorBar, LinearColorMapper
+    from bokeh.palettes import Inferno256
+
     place, runs = next(iter(d.where), None), d.evidence.runs[:most]
-    fig, axes = style.canvases(1, (3.4 * len(runs) + 1.2, 3.8), len(runs), sharex=False)
     name = place.channel if place is not None else CHANNEL_NAMES[d.evidence.channels[0]]
     drawn = [_place_errors(d, i, name) for i in range(len(runs))]
     top = max((float(np.quantile(e, 0.98)) for _, _, e in drawn if len(e)), default=1.0)
-    for ax, run, (at, t_s, error) in zip(axes, runs, drawn, strict=True):
-        ax.plot(at[:, 0], at[:, 1], "-", color=style.EXPECTED, linewidth=1.0)
+    mapper = LinearColorMapper([*Inferno256[::-1][30:-20]], low=0.0, high=top)
+    for i, (run, (at, t_s, error)) in enumerate(zip(runs, drawn, strict=True)):
+        plot = sheet.add_map(f"path{i}", "x, m", "y, m", 320)
+        plot.line(at[:, 0], at[:, 1], "path", style.NEUTRAL, width=1.0)
         if place is not None:
             index = [r for r, _ in REGIMES].index(place.regime)
             known = np.interp(t_s, run.time_s[np.argsort(run.time_s)], _in_regime(d, run, index)) > 0.5
-            ax.plot(at[known, 0], at[known, 1], "o", color=style.TRUTH, markersize=7, fillstyle="none")
-        points = ax.scatter(at[:, 0], at[:, 1], c=error, s=14, cmap="YlOrRd", vmin=0.0, vmax=top, zorder=3)
-        x, y = _limits(at)
-        ax.set(xlim=x, ylim=y, aspect="equal")
-        style.format_axes(ax, x="x, m", y="y, m", title=Path(run.name).name)
-    fig.colorbar(points, ax=axes, label=f"{name}: RMS error of {PLACE_S:g} s, {CHANNEL_UNITS[name]}")
-    return fig
-
-
-def _limits(at: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of both axes of a path (N, 2), m; a straight one is not drawn on a line."""
-    low, high = at.min(axis=0), at.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.55 * (high - low)
-    half = np.maximum(half, max(LEAST_SIDE * float(half.max()), 0.5))
-    (x0, y0), (x1, y1) = (middle - half).tolist(), (middle + half).tolist()
-    return (x0, x1), (y0, y1)
+            plot.dots(at[known, 0], at[known, 1], place.regime, style.TRUTH_ON_ANY, "ring", 10.0)
+        colour = {"field": "error", "transform": mapper}
+        tips = {f"{name}, {CHANNEL_UNITS[name]}": "@error{0.###}", "time, s": "@t{0.#}"}
+        data = {"x": at[:, 0], "y": at[:, 1]}
+        more = {"error": error, "t": t_s}
+        plot.glyph("scatter", data, "", colour, "dot", more=more, tips=tips, size=6.0, line_width=0)
+        look = {"background_fill_alpha": 0.0, "major_label_text_color": style.NEUTRAL}
+        plot.panel.figure.add_layout(ColorBar(color_mapper=mapper, width=10, padding=2, **look), "right")
+        plot.panel.figure.title = Path(run.name).name
+        plot.panel.figure.title.text_color = style.NEUTRAL
+    return [f"path{i}" for i in range(len(runs))]
 
 
 def _in_regime(d: GapDiagnosis, run: WhitenedRun, index: int) -> Array:
@@ -123,32 +121,29 @@ def _positions(d: GapDiagnosis, run: WhitenedRun, t_s: Array) -> Array:
     return np.stack([np.interp(t_s, grid, x) for x in path], axis=1)
 
 
-def plot_shrink(d: GapDiagnosis) -> Figure:
-    """Error of every channel before and after, and in the references, in sigmas and in its unit."""
+def plot_shrink(sheet: Sheet, d: GapDiagnosis) -> None:
+    """Error of every channel before, after and in the references, in sigmas; its unit beside the name."""
     names, rows = list(d.shrinkage.channels), list(d.shrinkage.channels.values())
-    fig, ax = style.canvas((9.0, 1.2 + 0.42 * len(names)))
-    at = np.arange(len(names))[::-1]
-    for shift, colour, label, k in ((0.2, style.BEFORE, "before", 0), (-0.2, style.AFTER, "after", 1)):
-        ax.barh(at + shift, [row[k] or 0.0 for row in rows], height=0.38, color=colour, label=label)
-    for y, name, row in zip(at, names, rows, strict=True):
+    texts = []
+    for name in names:
         before, after, _ = d.shrinkage.physical[name]
-        text = f"{before:.2g} \u2192 {after:.2g} {CHANNEL_UNITS[name]}"
-        ax.text(max(x or 0.0 for x in row), y, f"  {text}", va="center", fontsize=8)
-        if row[2] is not None:
-            ax.plot([row[2], row[2]], [y - 0.42, y + 0.42], color=style.TRUTH, linewidth=1.5)
+        texts.append(f"{name}: {before:.2g} \u2192 {after:.2g} {CHANNEL_UNITS[name]}")
+    plot = sheet.add_rows("rows shrink", "root mean square error, in sigmas of its noise", texts)
+    arms = [("before", style.BEFORE, "circle", 0), ("after", style.AFTER, "circle", 1)]
     if d.references:
-        ax.plot([], [], color=style.TRUTH, linewidth=1.5, label="references")
-    ax.set_yticks(at, names)
-    ax.set_xlim(0.0, 1.3 * max(x or 0.0 for row in rows for x in row))
-    ax.legend(fontsize=8, frameon=False, loc="lower right")
-    style.format_axes(ax, x="root mean square error, in sigmas of its noise; numbers: in its unit")
-    return fig
+        arms.append(("references", style.TRUTH_ON_ANY, "ring", 2))
+    at = np.arange(len(names), dtype=float)
+    ends = {"y0": at, "y1": at} | {f"x{k}": np.array([row[k] or 0.0 for row in rows]) for k in (0, 1)}
+    plot.glyph("segment", ends, "", style.NEUTRAL, "line", line_width=2)
+    for label, colour, marker, k in arms:
+        values = np.array([np.nan if row[k] is None else row[k] for row in rows], dtype=float)
+        plot.dots(values, at, label, colour, marker, 9.0)
 
 
-def plot_errors(d: GapDiagnosis, run: int) -> Figure:
-    """Errors of one run over time in the units of the channels, before and after."""
+def plot_errors(sheet: Sheet, d: GapDiagnosis, run: int) -> list[str]:
+    """Errors of one run over time in the units of the channels, before and after; the keys of the figures."""
     evidence, channels = d.evidence.runs[run], d.evidence.channels
-    fig, axes = style.channel_grid(len(channels), 1.5, 1.2)
+    sheet.begin_axis(float(evidence.time_s.max(initial=1.0)))
     arms = [
         (label, colour, physical_error(evidence, d.evidence.noise, errors[run]))
         for label, colour, errors in (
@@ -156,11 +151,12 @@ def plot_errors(d: GapDiagnosis, run: int) -> Figure:
             ("after", style.AFTER, d.shrinkage.errors_after),
         )
     ]
-    for i, (ax, channel) in enumerate(zip(axes, channels, strict=True)):
+    keys = [f"error{run}_{i}" for i in range(len(channels))]
+    for i, (key, channel) in enumerate(zip(keys, channels, strict=True)):
+        unit = CHANNEL_UNITS[CHANNEL_NAMES[channel]]
+        plot = sheet.add_time(key, f"{channel.rsplit('_', 1)[0]}, {unit}", 170)
         mine = np.flatnonzero(evidence.channel == i)
-        mine = mine[:: max(1, len(mine) // style.MAX_POINTS)]
+        mine = mine[style.thin(len(mine))]
         for label, colour, error in arms:
-            ax.plot(evidence.time_s[mine], error[mine], ".", color=colour, markersize=2, label=label)
-        style.format_axes(ax, title=f"{channel.rsplit('_', 1)[0]}, {CHANNEL_UNITS[CHANNEL_NAMES[channel]]}")
-    style.finish_grid(fig, axes)
-    return fig
+            plot.dots(evidence.time_s[mine], error[mine], label, colour, size=2.5)
+    return keys

@@ -38,13 +38,16 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     assert answer["runs"] == [str(logs / "run300"), str(logs / "run301")]
     assert answer["reference_runs"] == [str(logs / f"run{100 + i}") for i in range(6)]
     page = (tmp_path / "out/report.html").read_text("utf-8")
-    assert page.index('<p class="lead">Gap caused by wheel_radius or grousers (') < page.index("<h2>")
+    assert page.index("<strong>Gap caused by wheel_radius or grousers (") < page.index("<h2>")
     assert "The references cover over 99 % of the time of these drives." in page
     assert re.search(r"<th>wheel_radius or grousers, .*</th>\s*<td class=\"n\">\d\d %</td><td>yes</td>", page)
     assert re.search(r'<td class="n">[0-9.]+ m</td>', page)
     cells = re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", page)
     assert max(cell.count(",") for cell in cells) < 5
-    assert page.count("<figure>") == 6  # path, map, causes, shrink, errors of two runs
+    keys = re.findall(r'id="plot-(\w+)"', page)
+    assert keys[:5] == ["path0", "path1", "where", "causes", "shrink"]
+    assert {key.split("_")[0] for key in keys[5:]} == {"error0", "error1"}
+    assert page.count('class="tile"') == 3
     assert "Before and after" in page
     lines = done.out.splitlines()
     assert lines[0].startswith("Gap caused by wheel_radius or grousers (")

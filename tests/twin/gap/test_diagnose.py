@@ -14,6 +14,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.fusion.reports.gap_text import answer as screen
 from terrafusion.fusion.reports.plots.gap import plot_shrink
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import (
@@ -308,9 +309,9 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
 
 def test_a_plot_names_references_where_there_are_any(wide: GapDiagnosis, unreferred: GapDiagnosis) -> None:
     for found, labels in ((wide, ["before", "after", "references"]), (unreferred, ["before", "after"])):
-        legend = plot_shrink(found).axes[0].get_legend()
-        assert legend is not None
-        assert {text.get_text() for text in legend.get_texts()} == {*labels}
+        sheet = Sheet()
+        plot_shrink(sheet, found)
+        assert [*sheet.panels["shrink"].legend] == labels
 
 
 @pytest.mark.parametrize("first", [410, 430])
