@@ -4,6 +4,7 @@ The reference is the truth of a recording or held-out GNSS fixes. `scores` conde
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,14 +162,12 @@ def travelled_m(position_m: ArrayLike, min_step_m: float = MIN_STEP_M) -> Array:
     """Distance (N,) travelled up to each of the horizontal positions (N, 2 or more).
 
     A position counts once it is `min_step_m` away from the last one that counted, so that noise at rest does
-    not add up.
+    not add up; unknown ones (NaN) do not count.
     """
     total = 0.0
     out = np.zeros(len(np.asarray(position_m)))
     points = np.asarray(position_m, dtype=float)[:, :2].tolist()
-    if not points:
-        return out
-    x0, y0 = points[0]
+    x0, y0 = next(((x, y) for x, y in points if x == x and y == y), (math.nan, math.nan))
     square = min_step_m * min_step_m
     for i, (x, y) in enumerate(points):
         step = (x - x0) ** 2 + (y - y0) ** 2

@@ -235,6 +235,12 @@ def test_forgetting_keeps_the_information() -> None:
     assert short.first == 22
     np.testing.assert_allclose(short.nodes[-1].delta, whole.nodes[-1].delta, atol=1e-8)
     np.testing.assert_allclose(short.covariance(), whole.covariance(), rtol=1e-6, atol=1e-12)
+    for chain in (short, whole):
+        chain._back_substitute_to(24, solved=chain.last)
+        chain._back_substitute_to(23, solved=26)
+    for k in range(23, 30):
+        found = short.nodes[k - short.first].delta
+        np.testing.assert_allclose(found, whole.nodes[k].delta, atol=1e-8)
 
 
 def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:

@@ -83,3 +83,15 @@ def test_without_sides_there_is_nothing_to_compare() -> None:
     unit = GyroUnit(0.5, sides=False)
     for i in range(1000):
         unit.check(i * 20_000_000, 60.0, WheelStream())
+
+
+def test_a_window_begun_anew_begins_without_a_turn() -> None:
+    """Just below the bound, with a pause after every window."""
+    wheels, unit = WheelStream(), GyroUnit(0.5, sides=True)
+    for i in range(50 * 30):
+        t_ns = i * 20_000_000
+        wheels.add(t_ns, 0.45, 0.55)
+        if i % 70 < 55:
+            unit.check(t_ns, 0.2 * 9.8, wheels)
+    assert not unit.in_degrees
+    assert len(unit._ratios) == WINDOWS

@@ -261,3 +261,11 @@ def test_no_seeds_is_a_one_line_error(capsys):
     assert capsys.readouterr().err.count("\n") == 1
     assert twin.command(["--seeds", "1", "--terrain", "cheese"]) == 1
     assert "cheese" in capsys.readouterr().err
+
+
+def test_correlation_has_no_unit():
+    values = np.random.default_rng(4).normal(size=(50, 2))
+    rows = np.ones(50, dtype=bool)
+    whole = c.squared_correlation(values, rows)
+    np.testing.assert_allclose(c.squared_correlation(1e-3 * values, rows), whole, atol=1e-9)
+    assert c.squared_correlation(0.0 * values, rows)[:2].tolist() == [1.0, 0.0]

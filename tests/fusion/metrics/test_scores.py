@@ -15,11 +15,13 @@ from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
-from terrafusion.fusion.metrics.error_series import Errors, travelled_m
+from terrafusion.fusion.metrics.error_series import Errors, align_start, travelled_m
 from terrafusion.fusion.metrics.scores import (
     Outage,
     Scores,
     parse_outage,
+    path_pairs,
+    relative_error_m,
     score,
 )
 
@@ -251,6 +253,8 @@ def test_held_out_fixes_are_compared_at_the_antenna(drive):
     ahead = dataclasses.replace(d.fixes, enu_m=d.fixes.enu_m + np.array([0.4, 0.0, 0.0]))
     plain = score(d.estimate, without_truth(d.recording), held_out=ahead)
     assert plain.against == "gnss_held_out"
+    assert any("noise of the fixes" in note for note in plain.notes)
+    assert not any("noise of the fixes" in note for note in score(d.estimate, d.recording).notes)
     assert plain.held_out.median_m == pytest.approx(0.4)
     assert plain.held_out.fixes == len(ahead)
     assert plain.yaw_rmse_rad is None
@@ -373,3 +377,43 @@ def test_scoring_a_long_drive_is_quick(drive):
         score(d.estimate, d.recording, held_out=d.fixes, outages=[Outage(100, 60)], antenna_m=(0.1, 0, 0.3))
         spent.append(time.process_time() - begun)
     assert min(spent) < 0.25
+
+
+def test_pairs_without_a_reference_heading_are_compared_in_the_world(drive):
+    errors = score((d := drive(drift_mps=0.02)).estimate, d.recording).errors
+    first, last = path_pairs(errors, 10.0)
+    blind = dataclasses.replace(errors, reference_yaw_rad=np.full(len(errors.t_ns), np.nan))
+    moved = errors.position_error_m()[last] - errors.position_error_m()[first]
+    np.testing.assert_allclose(relative_error_m(blind, first, last), np.hypot(*moved.T))
+    nothing = np.zeros(0, dtype=int)
+    assert len(relative_error_m(blind, nothing, nothing)) == 0
+
+
+def test_travel_begins_where_the_position_is_first_known():
+    unknown = [[np.nan, np.nan]]
+    path = np.concatenate([unknown, [[1.0, 0.0], [3.0, 0.0]], unknown, [[3.0, 1.0]]])
+    assert travelled_m(path).tolist() == [0.0, 0.0, 2.0, 2.0, 3.0]
+    assert travelled_m(unknown).tolist() == [0.0]
+
+
+def straight(heading: bool) -> Errors:
+    """Four positions a metre apart along east, the first unknown; the estimate runs north from elsewhere."""
+    x, n = np.arange(5.0), 5
+    reference, estimate = np.stack([x, 0.0 * x], axis=1), np.stack([0.0 * x + 7.0, x + 3.0], axis=1)
+    reference[0] = np.nan
+    yaw = np.zeros(n) if heading else np.full(n, np.nan)
+    return Errors(
+        np.arange(n) * 10**9, estimate, reference, np.full(n, np.pi / 2.0), yaw, np.zeros((n, 2)),
+        np.tile(np.diag([4.0, 1.0]), (n, 1, 1)), np.full(n, 0.1),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("heading", [True, False])
+def test_a_start_is_aligned_by_its_heading_or_by_least_squares(heading):
+    moved, how = align_start(straight(heading))
+    assert moved.position_error_m()[1:] == pytest.approx(np.zeros((4, 2)), abs=1e-9)
+    assert moved.estimate_yaw_rad == pytest.approx(np.zeros(5), abs=1e-9)
+    np.testing.assert_allclose(moved.covariance_m2[1], np.diag([1.0, 4.0]), atol=1e-9)
+    assert np.isfinite(moved.velocity_error_mps).all() == heading  # of fixes: east-north of another frame
+    said = "its first position and the mean heading over its first metre"
+    assert how == (said if heading else "a least-squares fit over the first 3.0 m")

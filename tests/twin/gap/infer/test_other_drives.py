@@ -9,7 +9,12 @@ from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.other_drives import (
     CANDIDATE_SCATTER,
+    JITTER,
+    MISFIT_SCATTER,
     NUISANCE_SCATTER,
+    UNKNOWN_SIZES,
+    WIDE,
+    _deviations,
     detect,
     learn_misfit,
     learn_offsets,
@@ -118,3 +123,40 @@ def test_laws_that_act_otherwise_on_another_drive_are_no_gap() -> None:
 
 def test_the_same_seed_gives_the_same_bits() -> None:
     assert p_value(3, "other") == p_value(3, "other")
+
+
+def test_references_that_show_nothing_teach_no_scatter_of_the_misfit() -> None:
+    offsets = learn_offsets(trial(1, "reference")[0], len(CANDIDATES.keys))
+    blind = [Score(np.zeros(P + 2), np.zeros((P + 2, P + 2)), 0.0, ROWS)] * 5
+    found = learn_misfit(blind, offsets, 0.5, 0.25)
+    np.testing.assert_allclose(found.scatter, np.append(offsets.scatter, [MISFIT_SCATTER**2] * 2))
+    own = np.diag(found.covariance)
+    np.testing.assert_allclose(own, np.append(offsets.prior, [0.5**2 + 0.25] * 2))
+
+
+def test_deviations_are_likelihood_ratios() -> None:
+    """Of scores x ~ N(U c, S): by the best sizes c ~ N(0, WIDE^2) of a form, and by the mean likelihood of
+    unknown causes of several sizes."""
+    from scipy.stats import multivariate_normal as normal
+
+    J = 0.1 * DRIVES["other"][:40]
+    A = J.T @ J
+    spread = A @ A + A
+    x = np.random.default_rng(3).standard_normal((2, P))
+    found = _deviations(A, spread, CANDIDATES)(x / (1.0 / np.sqrt(np.diag(A) + 1.0)))
+    root = 1.0 / np.sqrt(np.diag(A) + 1.0)
+    S, U = root[:, None] * spread * root + JITTER * np.eye(P), root[:, None] * A
+    inverse = np.linalg.inv(S)
+    forms = [list(h.columns) for h in CANDIDATES.hypotheses]
+    for y, row in zip(x, found, strict=True):
+        wanted = list(y**2 / np.diag(S))
+        for c in forms:
+            H = U[:, c].T @ inverse @ U[:, c] + np.eye(len(c)) / WIDE**2
+            best = np.linalg.solve(H, U[:, c].T @ inverse @ y)
+            left = y - U[:, c] @ best
+            wanted.append(y @ inverse @ y - left @ inverse @ left - best @ best / WIDE**2)
+        n = U[:, len(CANDIDATES.keys) :]
+        zero = np.zeros(P)
+        ratios = [normal(zero, S + s**2 * n @ n.T).pdf(y) / normal(zero, S).pdf(y) for s in UNKNOWN_SIZES]
+        wanted.append(2.0 * np.log(np.mean(ratios)))
+        np.testing.assert_allclose(row, np.maximum(wanted, 0.0), rtol=1e-6, atol=1e-9)
