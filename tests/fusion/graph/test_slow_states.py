@@ -125,3 +125,43 @@ def test_a_change_older_than_what_is_held_is_spread_over_all_that_is() -> None:
     slow_states.inflate_slip_covariance(chain, 0, 0.1, SAND, 0.02, 100.0, 1.0)
     for node in chain.nodes[1:]:
         assert node.markov.decay[SLIP] == pytest.approx(np.sqrt(1.0 - slow_states.MOST_SWITCH), rel=0.01)
+
+
+def test_what_is_assumed_of_a_robot_before_any_data() -> None:
+    """The priors of the vehicle file's numbers, as docs/explanation/calibration-states.md has them, and how
+    long what a ground gives lasts."""
+    mean, sigma = slow_states.prior(SAND, 0.1, 0.02)
+    told = dict(zip(LINEAR, sigma.tolist(), strict=True))
+    assert [told[name] for name in slow_states.CALIBRATION_SIGMA] == [
+        0.02,
+        0.05,
+        0.05,
+        *[0.02] * 3,
+        0.03,
+        0.1,
+    ]
+    assert mean[SLIP] == SAND.slip_at(0.1)
+    assert mean[LINEAR.index("yaw_scale")] == SAND.yaw_scale_mean
+    assert told["yaw_scale"] == pytest.approx(np.hypot(SAND.yaw_scale_sigma, 0.2))
+    assert (told["icr_x_m"], told["side_slip"]) == (0.1, pytest.approx(0.3 * SAND.side_slip_sigma))
+    assert np.count_nonzero(sigma == 0.02) == 2 + 4  # the receiver's drift east and north
+    taken = step(rolling(1.0))
+    lasting_s = -0.1 / np.log(taken.decay[[LINEAR.index(n) for n in ("yaw_scale", "icr_x_m", "side_slip")]])
+    assert lasting_s == pytest.approx([60.0, 60.0, 5.0])
+
+
+def test_side_slip_and_renewal_are_in_proportion() -> None:
+    """Downhill by .7 of what a grade as steep costs, doubted by .3; x of the speed renews 1.1 x^2 of slip."""
+    up = np.array([0.0, 0.1, np.sqrt(0.99)])
+    taken, level = step(rolling(1.0), up), step(rolling(1.0))
+    downhill = -0.7 * SAND.slip_per_grade * 0.1
+    assert taken.mean[SIDE] == pytest.approx(downhill)
+    kept = level.decay[SIDE]
+    spread = [np.sqrt(one.sigma[SIDE] ** 2 / (1.0 - kept**2)) for one in (taken, level)]
+    assert spread[0] == pytest.approx(np.hypot(spread[1], 0.3 * downhill))
+    changed = step(rolling(2.0, 0.2))
+    assert changed.decay[SLIP] / level.decay[SLIP] == pytest.approx(1.0 - 1.1 * 0.1**2)
+    crawling = step(rolling(0.05, 0.02))  # as of .1 m/s
+    assert crawling.decay[SLIP] / level.decay[SLIP] == pytest.approx(1.0 - 1.1 * 0.2**2)
+    both = step(rolling(2.0, 0.2), switch=0.5)
+    assert both.decay[SLIP] / level.decay[SLIP] == pytest.approx(0.5 * (1.0 - 0.011))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics.baselines import Baselines, OutageBaseline
 from terrafusion.fusion.metrics.scores import Outage, OutageScore, score
-from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
+from terrafusion.fusion.metrics.verdict import Run, Verdict, _fix_sigma_m, _longest, judge
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.verdicts import FAULTS, is_wrong, short_drive
 
@@ -243,3 +244,15 @@ def test_a_clock_of_wheels_or_imu_that_is_off_is_not_good(drive, channel, value)
         "clock-offset", "warning", channel, "its times are 0.29 s late", "correlation 0.96", "move them"
     )
     assert verdict(d, estimate=consistent(d), findings=[late]).value == value
+
+
+def test_the_sigma_of_fixes_is_the_typical_horizontal_one() -> None:
+    sigma = np.array([[0.1, 0.3, 9.0], [0.4, 0.2, 9.0], [2.0, 1.0, 9.0], [np.inf, 1.0, 9.0]])
+    assert _fix_sigma_m(SimpleNamespace(sigma_enu_m=sigma)) == 0.4  # type: ignore[arg-type]
+    assert _fix_sigma_m(None) == 0.0
+
+
+def test_the_longest_run_is_the_first_of_those_as_long() -> None:
+    assert _longest([True, False, True, True, False, True, True]) == (2, 4)
+    assert _longest([False]) is None
+    assert _longest([True]) == (0, 1)
