@@ -90,11 +90,15 @@ def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
         recording: the log.
         rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
     """
-    context = CheckContext(recording, rig)
+    with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN and huge numbers warn
+        return _findings(CheckContext(recording, rig))
+
+
+def _findings(context: CheckContext) -> list[Finding]:
     findings = list(check_magnitude(context))
     if not findings:  # the others would compute with impossible numbers
         findings = [finding for check in CHECKS for finding in check(context)]
-    elif _may_be_units(recording, findings):
+    elif _may_be_units(context.recording, findings):
         units = [finding for check in UNIT_CHECKS for finding in check(context) if finding.code in UNIT_CODES]
         explained = {finding.channel for finding in units}
         findings = units + [finding for finding in findings if finding.channel not in explained]

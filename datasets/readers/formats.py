@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
+
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -55,7 +57,8 @@ class Format:
 
     def read(self, request: Request) -> Sequence[Recording]:
         """The recordings in the file."""
-        recordings: Sequence[Recording] = import_module(self.module).read(request)
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are a finding, not a warning
+            recordings: Sequence[Recording] = import_module(self.module).read(request)
         return recordings
 
     def member(self, path: Path) -> Path | None:

@@ -123,6 +123,7 @@ def is_text(data: bytes) -> bool:
 def mutated(rng: np.random.Generator, sample: Path, folder: Path) -> Path:
     """A copy of the sample in `folder` with one of its files mutated; returns what is to be opened."""
     target = folder / sample.name
+    shutil.rmtree(target, ignore_errors=True)  # of the same case in a child that it ended
     shutil.copytree(sample, target)
     files = sorted(path for path in target.rglob("*") if path.is_file() and path.name != ".open")
     victim = files[int(rng.integers(0, len(files)))]

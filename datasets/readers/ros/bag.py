@@ -33,6 +33,8 @@ from terrafusion.datasets.readers.ros.topics import (
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
+MOST_TEXT = 300
+"""Of what a parser says: it may quote the whole definition of a message."""
 
 
 @contextmanager
@@ -55,7 +57,7 @@ def opened_bag(
         with closing(container):
             yield container
     except BagError as error:
-        what = f"cannot be read as a ROS bag: {error}"
+        what = f"cannot be read as a ROS bag: {str(error)[:MOST_TEXT]}"
         raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
 
 

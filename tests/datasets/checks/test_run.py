@@ -142,3 +142,14 @@ def test_sparse_logs_have_no_finding(drive: Recording) -> None:
             alone = Recording("x", drive.start_ns, **{name: channel.select(slice(0, n))})
             assert run_checks(alone) == [], (name, n)
     assert run_checks(Recording("x", 0)) == []
+
+
+def test_a_signalling_nan_warns_no_more_than_another(drive: Recording) -> None:
+    assert drive.wheels is not None
+    speed = drive.wheels.speed.copy()
+    speed.view(np.uint64)[5, 0] = 0x7FF0000000000001
+    assert np.isnan(speed[5, 0])
+    broken = dataclasses.replace(drive, wheels=dataclasses.replace(drive.wheels, speed=speed))
+    speed = np.where(np.isnan(speed), np.nan, speed)
+    quiet = dataclasses.replace(drive, wheels=dataclasses.replace(drive.wheels, speed=speed))
+    assert [f.code for f in run_checks(broken)] == [f.code for f in run_checks(quiet)]

@@ -266,3 +266,12 @@ def test_a_definition_without_a_needed_field_is_told(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"Vector3 angular_velocity", b"Vector3 angular_velozity"))
     with pytest.raises(TerrafusionError, match=r"a\.bag, /imu: .*no 'angular_velocity"):
         open_recording(path)
+
+
+def test_a_damaged_definition_is_not_quoted_whole(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", "")
+    path.write_bytes(path.read_bytes().replace(b"float64[9] angular", b"float64[9] angul`r"))
+    with pytest.raises(TerrafusionError, match="cannot be read as a ROS bag") as refused:
+        open_recording(path)
+    assert len(str(refused.value)) < 600
+    assert "\n" not in str(refused.value)

@@ -174,6 +174,7 @@ BAD: dict[str, tuple[int, Callable[[list[str]], list[str]], tuple[str, ...]]] = 
     "wheels aside": (1, put(11, 2, "0.25"), ("line 12", "sideways", "t = 1.100 s")),
     "vx and vy swapped": (1, columns(0, 2, 1, 3), ("sideways",)),
     "no quaternion": (2, put(20, 7, "0.5"), ("line 21", "quaternion", "t = 0.333 s")),
+    "quaternion of huge numbers": (2, put(20, 7, "1e300"), ("line 21", "quaternion")),
     "time runs back": (2, lambda x: [*x[:9], x[7], *x[10:]], ("line 10", "runs backwards by 0.016667 s")),
 }  # fmt: skip
 
