@@ -377,7 +377,8 @@ class Estimator:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
         self.weights.update(state, self.imu, self.wheels, self._skid.friction)
-        self.learned.advance(self.chain)
+        if self.learned.advance(self.chain):
+            self._covariance = self.chain.covariance()
 
     def _wheel_increment(
         self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState
@@ -429,8 +430,7 @@ class Estimator:
     def _emitted(self, t_ns: int, gyro: Array) -> State:
         key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
         outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
-        spec = self.config.rig.sensors.imu
-        gyro_sigma = gyro_sigma_radps(spec, self.config.keyframe_s, self.weights.noise)
+        gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.noise)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),

@@ -147,22 +147,25 @@ class LearnedNumbers:
         t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
         learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
 
-    def advance(self, chain: Chain) -> None:
+    def advance(self, chain: Chain) -> bool:
         """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new
-        numbers.
+        numbers. True when that put the place in doubt.
         """
         learning = self.calibration
         if learning is None or not learning.advance():
-            return
-        if self._before_slide is None or self._late_fixes(learning):
-            self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
-            self._past.append((t_ns, self._known))
-            antenna_m, delay_s = gnss.antenna_m, gnss.delay_s
-            self._apply(self._known, t_ns)
-            speed_mps = float(np.linalg.norm(chain.state(chain.last).velocity))
-            moved_m = math.hypot(*(gnss.antenna_m - antenna_m)[:2], speed_mps * (gnss.delay_s - delay_s))
-            if moved_m > learning.usual_sigma_m:
-                _doubt_place(chain, moved_m)
+            return False
+        if self._before_slide is not None and not self._late_fixes(learning):
+            return False
+        self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
+        self._past.append((t_ns, self._known))
+        antenna_m, delay_s = gnss.antenna_m, gnss.delay_s
+        self._apply(self._known, t_ns)
+        speed_mps = float(np.linalg.norm(chain.state(chain.last).velocity))
+        moved_m = math.hypot(*(gnss.antenna_m - antenna_m)[:2], speed_mps * (gnss.delay_s - delay_s))
+        if moved_m <= learning.usual_sigma_m:
+            return False
+        _doubt_place(chain, moved_m)
+        return True
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
         """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
