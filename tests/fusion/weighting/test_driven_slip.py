@@ -102,13 +102,17 @@ def test_learned_slip_survives_a_dump(robot: str) -> None:
     assert restored.noise.slip_mean != Estimator(config).weights.noise.slip_mean
 
 
-def test_mean_and_spread_are_those_of_the_conjugate_prior() -> None:
-    """Two windows that count for one observation each, beside two of the prior's mean, four of its spread."""
-    found, sigma = DrivenSlip(POLICY), PRIOR_SIGMA[SAND]
-    for off in (0.03, 0.09):  # as badly measured as the prior is wide: half counts
-        found.add(ON_SAND, PRIOR[SAND] + off, sigma, 0.0, 4.0 * TIME_S[SAND])
+def test_mean_and_spread_are_those_of_two_normals_by_hand() -> None:
+    """Two windows of four correlation times, measured as badly as the policy's slip spreads."""
+    found, sigma, driven_s = DrivenSlip(POLICY), PRIOR_SIGMA[SAND], 8.0 * TIME_S[SAND]
+    for off in (0.03, 0.09):
+        found.add(ON_SAND, PRIOR[SAND] + off, sigma, 0.0, 0.5 * driven_s)
     mean, spread = (values[SAND] for values in found.posterior())
-    assert mean == pytest.approx(PRIOR[SAND] + 0.06 * 2.0 / 4.0)
-    square = 2.0 * 0.03**2 + 0.06**2 * 2.0 * 2.0 / 4.0
-    variance = (4.0 * sigma**2 / 1.5 + square) / (4.0 + 2.0) * (1.0 + 1.0 / 4.0)
-    assert spread == pytest.approx(np.sqrt(variance))
+    between, within = sigma**2 / 3.0, sigma**2 * 2.0 / 3.0
+    variance = (
+        sigma**2 / driven_s + within * 2.0 / 10.0
+    )  # of what was measured: its errors, slip's own changes
+    share = between / (between + variance)
+    assert mean == pytest.approx(PRIOR[SAND] + 0.06 * share)
+    square = 2.0 * 0.03**2  # each window is one observation, half a one for its errors of two
+    assert spread == pytest.approx(np.sqrt((4.0 * within + square) / (4.0 + 2.0) + share * variance))
