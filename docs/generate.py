@@ -247,6 +247,8 @@ def on_files(files: Any, config: Any) -> Any:
     for path in results():
         text = path.read_text(encoding="utf-8")
         files.append(File.generated(config, f"evidence/results/{path.name}", content=text))
+    for path in sorted((ROOT / RESULTS).glob("*.png")):
+        files.append(File.generated(config, f"evidence/results/{path.name}", abs_src_path=str(path)))
     return files
 
 

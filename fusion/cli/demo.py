@@ -19,18 +19,14 @@ if TYPE_CHECKING:
     from terrafusion.fusion.reports.demo import DemoRun, Table
 
 OUTPUT = Output(
-    "Folder for the log, the results, demo.png and report.html.",
-    ("config.json", "log", "fixed", "adaptive", "demo.png", "report.html"),
+    "Folder for the log, the results and report.html.",
+    ("config.json", "log", "fixed", "adaptive", "report.html"),
     ("log/meta.yaml", "fixed/metrics.json"),
 )
 OUTAGE_START_S, OUTAGE_S = 75.0, 60.0
 """GNSS is lost on loose sand and comes back on mud."""
 MODES = ("fixed", "adaptive")
 TITLE = "Firm ground, loose sand and mud: fixed against adaptive weights"
-CAPTION = (
-    "Left: the paths of the first drive; the odometry frame drifts but never jumps. Right: position error of "
-    "all drives, median and range."
-)
 
 
 def demo(
@@ -42,7 +38,7 @@ def demo(
     """Simulate drives over firm ground, loose sand and mud; localise each with fixed and adaptive weights.
 
     The drives differ in the noise of the sensors. One GNSS outage covers the change of terrain. Prints the
-    comparison, draws it into demo.png and writes report.html with the details of the first drive.
+    comparison and writes report.html with the errors of all drives and the details of the first.
 
     Example: terrafusion demo --out demo-out
 
@@ -51,8 +47,7 @@ def demo(
     """
     from terrafusion.datasets.readers import open_recording
     from terrafusion.datasets.writers.log_folder import write_log_folder
-    from terrafusion.fusion.reports.demo import plot_demo, table_of
-    from terrafusion.fusion.reports.page import write_png
+    from terrafusion.fusion.reports.demo import plot_drives, table_of
     from terrafusion.fusion.reports.replay import write_comparison, write_replay
     from terrafusion.twin.executors import open_workers
     from terrafusion.twin.simulate import simulate
@@ -71,9 +66,7 @@ def demo(
     results = [by_mode[mode] for mode in MODES]
     for result in results:
         write_replay(out / result.mode, result)
-    figure = plot_demo(runs, seed, recording, results[0].outages[0])
-    write_png(out / "demo.png", figure, dpi=90)
-    write_comparison(out / "report.html", TITLE, results, overview=(figure, CAPTION))
+    write_comparison(out / "report.html", TITLE, results, more=lambda sheet: plot_drives(sheet, runs))
     document: dict[str, Any] = {mode: read_json(out / mode / "metrics.json") for mode in MODES}
     table = table_of(runs, results[0].outages[0])
     document["drives"] = {"seeds": [seed + i for i in range(drives)], "errors_m": table}

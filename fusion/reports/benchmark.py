@@ -15,18 +15,20 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.json_text import to_json
+from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.benchmark.checkpoints import LIBRARIES, hash_sources, sources_sha256
 from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE
 from terrafusion.fusion.benchmark.plan import BenchmarkPlan
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run import BenchmarkResult
-from terrafusion.fusion.benchmark.targets import pooled_nees, targets
+from terrafusion.fusion.benchmark.targets import MISSED, REACHED, Target, pooled_nees, targets
 from terrafusion.fusion.benchmark.twin_runs import FIELD
 from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports.benchmark_tables import Section, tables
-from terrafusion.fusion.reports.page import write_page, write_png, write_text
+from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page, write_png, write_text
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 SCHEMA = "terrafusion.benchmark/1"
@@ -46,14 +48,31 @@ def write_benchmark(out: Path, result: BenchmarkResult, origin: Mapping[str, str
     sections = tables(result.rows)
     write_text(out / "benchmark.json", to_json(_content(result, origin), indent=1) + "\n")
     write_text(out / "benchmark.md", "\n".join(document_lines(sections, result, origin)) + "\n")
-    ratios = plot_ratios(contrasts(result.rows))
+    ratios, judged = plot_ratios(contrasts(result.rows)), targets(result.rows)
     write_png(out / "ratios.png", ratios, dpi=110)
     write_page(
         out / "report.html", "benchmark.html.j2", "Fixed against adaptive weighting",
-        provenance=origin, packages=LIBRARIES, tables=sections, ratios=ratios, caption=CAPTION,
+        verdicts=[_verdict(judged)], tiles=_tiles(judged), provenance=origin, packages=LIBRARIES,
+        tables=sections, ratios=ratios, caption=CAPTION,
         refused=[one.line for one in result.refused],
     )  # fmt: skip
     return sections
+
+
+def _verdict(judged: Sequence[Target]) -> VerdictBox:
+    """How many targets are reached, and a sentence for each that is missed."""
+    missed = [t for t in judged if t.verdict() == MISSED]
+    reached = sum(t.verdict() == REACHED for t in judged)
+    reasons = [f"Missed: {t.name}, {t.what}: {number(t.found)}, limit {t.limit:g}." for t in missed]
+    left = len(judged) - reached - len(missed)
+    title = f"{reached} of {len(judged)} targets are reached, {len(missed)} missed, {left} open"
+    return VerdictBox("not_to_be_used" if missed else "doubtful" if left else "good", title, reasons)
+
+
+def _tiles(judged: Sequence[Target]) -> list[Tile]:
+    """The first three ratios of adaptive to fixed weights."""
+    found = [t for t in judged if t.what.endswith(f"{ADAPTIVE} over {BASELINE}")][:3]
+    return [Tile(t.what, number(t.found), f"target {t.limit:g}: {t.verdict()}") for t in found]
 
 
 def write_document(

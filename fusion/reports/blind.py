@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_png
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_png
 from terrafusion.fusion.reports.plots import blind as plots
 
 Scores = Mapping[str, Any]
@@ -21,17 +21,16 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
     """
     sheet = plots.plot_sheet(scores)
     write_png(out / "sheet.png", sheet)
-    met = [row["diagnosis"]["met"] for row in scores["headline"] if row["target"]]
     own = scores["figures"]["diagnosis"]
     lead = (
-        f"Of {len(met)} targets {met.count(True)} are met, {met.count(False)} are missed, {met.count(None)} "
-        f"not measured. {len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
+        f"{len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
         "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
         f"all answers were in. Plant {plots.plant_name(scores)}."
     )
     write_page(
         out / "report.html", "blind.html.j2", f"Blind check of the diagnosis, {scores['trials']} trials",
-        lead=lead, provenance=provenance, packages=TWIN_LIBRARIES,
+        lead=lead, verdicts=[_verdict(scores)], tiles=_tiles(scores), provenance=provenance,
+        packages=TWIN_LIBRARIES,
         methods=list(scores["figures"]),
         headline=[
             [row["name"], *(measured(row[m]) for m in scores["figures"]), target_text(row["target"]),
@@ -39,7 +38,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
             for row in scores["headline"]
         ],
         sheet=sheet, kinds=VERDICTS,
-        verdicts=[
+        families=[
             [family, *(str(counts.get(kind, 0)) for kind in VERDICTS)]
             for family, counts in own["verdicts"].items()
             if counts
@@ -51,6 +50,33 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
         ],
         confusion=plots.plot_confusion(own["confusion"]),
     )  # fmt: skip
+
+
+def _verdict(scores: Scores) -> VerdictBox:
+    """How many targets are met, and a sentence for each that is missed."""
+    aimed = [row for row in scores["headline"] if row["target"]]
+    met = [row["diagnosis"]["met"] for row in aimed]
+    reasons = [
+        f"Missed: {row['name']}: {measured(row['diagnosis'])}, target {target_text(row['target'])}."
+        for row in aimed
+        if row["diagnosis"]["met"] is False
+    ]
+    value = "not_to_be_used" if reasons else "doubtful" if None in met else "good"
+    counts = f"{len(reasons)} missed, {met.count(None)} not measured"
+    title = f"{met.count(True)} of {len(met)} targets are met, {counts}"
+    return VerdictBox(value, title, reasons)
+
+
+def _tiles(scores: Scores) -> list[Tile]:
+    """The first three figures that have a target and were measured."""
+    known = [r for r in scores["headline"] if r["target"] and r["diagnosis"]["met"] is not None]
+    return [
+        Tile(
+            row["name"], rounded(row["diagnosis"]["value"]),
+            f"{measured(row['diagnosis'])}, target {target_text(row['target'])}",
+        )
+        for row in known[:3]
+    ]  # fmt: skip
 
 
 def rounded(value: float | None) -> str:

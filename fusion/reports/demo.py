@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 FIXED, ADAPTIVE = "fixed", "adaptive"
 EQUAL, EQUAL_M = 0.05, 0.005
 """Differences, relative and in metres, below which two errors count as equal: the table shows centimetres."""
-_ODOM = "#009e73"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,45 +94,14 @@ def _listed(rows: Sequence[str]) -> str:
     return " and ".join(rows)
 
 
-def plot_demo(runs: Sequence[DemoRun], shown_seed: int, recording: Recording, outage: Outage) -> Figure:
-    """Paths of one drive beside the errors of all drives, and the step from keyframe to keyframe."""
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=(11.0, 5.4), layout="constrained")
-    left, right = fig.subplots(1, 2, width_ratios=(1.15, 1.0))
-    shown = {run.mode: run for run in runs if run.seed == shown_seed}
-    _plot_paths(left, shown, recording)
-    _plot_errors(right, runs, outage)
-    return fig
-
-
-def _plot_paths(ax: Axes, shown: Mapping[str, DemoRun], recording: Recording) -> None:
-    truth = recording.truth
-    if truth is not None:
-        xy = truth.position_m[style.thin(len(truth)), :2]
-        ax.plot(*xy.T, color=style.TRUTH, linewidth=3.0, alpha=0.25, label="truth")
-    for mode, run in shown.items():
-        ax.plot(*run.path_m.T, color=style.colour_of(mode, style.MODE_COLOURS), linewidth=1.2, label=mode)
-    if ADAPTIVE in shown:
-        odom = shown[ADAPTIVE].odom_m
-        look: dict[str, Any] = {"color": _ODOM, "linewidth": 1.0, "linestyle": (0, (4, 2))}
-        ax.plot(*odom.T, label="adaptive, odometry frame", **look)
-    ax.set_aspect("equal", adjustable="datalim")
-    style.format_axes(ax, x="east, m", y="north, m")
-    style.legend_above(ax, columns=4)
-
-
-def _plot_errors(ax: Axes, runs: Sequence[DemoRun], outage: Outage) -> None:
-    style.shade_outages(ax, [outage])
+def plot_drives(sheet: Sheet, runs: Sequence[DemoRun]) -> None:
+    """Position error of all drives over time, median and range of each mode."""
+    plot = sheet.add_time("drives", f"position error of {len(runs) // 2} drives, m", 260)
     for mode in (FIXED, ADAPTIVE):
         own = [run for run in runs if run.mode == mode]
-        t_s = own[0].t_s
+        t_s = own[0].t_s[style.thin(len(own[0].t_s))]
         errors = np.array([np.interp(t_s, run.t_s, run.error_m) for run in own])
         colour = style.colour_of(mode, style.MODE_COLOURS)
-        rows = style.thin(len(t_s))
-        low, middle, high = np.nanmin(errors, 0), np.nanmedian(errors, 0), np.nanmax(errors, 0)
-        ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, alpha=0.18, linewidth=0)
-        ax.plot(t_s[rows], middle[rows], color=colour, linewidth=1.6, label=f"{mode}: median, range")
-    ax.set_ylim(bottom=0.0)
-    style.format_axes(ax, x=style.TIME, y=f"position error of {len(runs) // 2} drives, m")
-    style.legend_above(ax, columns=3)
+        band = {"x": t_s, "y1": np.nanmin(errors, 0), "y2": np.nanmax(errors, 0)}
+        plot.glyph("varea", band, f"{mode}: range", colour, "area", alpha=0.2)
+        plot.line(t_s, np.nanmedian(errors, 0), f"{mode}: median", colour)

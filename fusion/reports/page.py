@@ -14,9 +14,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.tables import number
 
@@ -79,6 +81,18 @@ def write_text(path: Path, text: str) -> Path:
         TerrafusionError: the file cannot be written.
     """
     return write_atomically(path, lambda part: part.write_text(text, "utf-8", "backslashreplace"))
+
+
+def need_matplotlib() -> None:
+    """Refuse to make a report whose pictures need matplotlib, before hours of computing.
+
+    Raises:
+        TerrafusionError: it is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise TerrafusionError(
+            "the package matplotlib is not installed", remedy="pip install 'terrafusion[plots]'"
+        )
 
 
 def write_png(path: Path, fig: Figure, dpi: int = 150) -> Path:

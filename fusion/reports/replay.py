@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
@@ -20,9 +20,6 @@ from terrafusion.fusion.reports.page import write_page
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter, replay_map, style
 from terrafusion.fusion.reports.plots.sheet import Sheet
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MOST_CHANGES = 20
 """How many of the weight changes the report lists; `weights.jsonl` has them all."""
@@ -55,7 +52,7 @@ def write_comparison(
     title: str,
     results: Sequence[ReplayResult],
     provenance: Mapping[str, object] | None = None,
-    overview: tuple[Figure, str] | None = None,
+    more: Callable[[Sheet], None] = lambda _: None,
 ) -> None:
     """One report over several replays of the same drive; see `write_report`."""
     first = results[0]
@@ -69,7 +66,7 @@ def write_comparison(
         outages=first.outages,
         wheel_radius_m=first.vehicle.odometry.wheel_radius_m,
         provenance=policy | dict(provenance or {}),
-        overview=overview,
+        more=more,
     )
 
 
@@ -83,7 +80,7 @@ def write_report(
     outages: Sequence[Outage] = (),
     wheel_radius_m: float | None = None,
     provenance: Mapping[str, object] | None = None,
-    overview: tuple[Figure, str] | None = None,
+    more: Callable[[Sheet], None] = lambda _: None,
 ) -> Path:
     """Write the report to `path`.
 
@@ -94,7 +91,7 @@ def write_report(
         outages: the stretches without GNSS.
         wheel_radius_m: to show the speed of wheels logged in rad/s.
         provenance: further lines for the last section, such as the command line and hashes of inputs.
-        overview: a figure and its caption, to stand before the numbers.
+        more: adds the figure "drives" of several drives, to stand first.
 
     Raises:
         TerrafusionError: the file cannot be written.
@@ -112,11 +109,12 @@ def write_report(
     marked = plots.important_changes(shown.estimate.changes, MOST_CHANGES, apart_s)
     rows = replay_text.score_rows(metrics)
     sheet, innovations = _draw(runs, shown, recording, held_out, outages, wheel_radius_m, marked)
+    more(sheet)
     labelled = recording.terrain is not None
     calibrations = {run.name: [cells(row) for row in run.metrics.get("calibration", ())] for run in runs}
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
-        overview=overview, runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
+        runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
         scores=rows, baselines=replay_text.shown_baselines(rows),
         tiles=replay_text.tiles(rows, names, pair[0]), **sheet.parts(), innovations=innovations,
         verdicts=replay_text.verdicts(names, metrics), assumed=_assumed(runs),

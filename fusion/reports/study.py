@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.core.json_text import finite, to_json
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
 from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
@@ -123,14 +123,20 @@ def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | None) -> None:
     every, predicted = counts(study.rows), counts(study.rows, PREDICTED)
-    lead = (
-        f"{TITLE}, by the twin with {study.plan.seed_count()} seeds a case. Of {len(study.rows)} statements "
-        f"and numbers: {_counts_text(every)}. Of the {sum(predicted.values())} that the twin was neither "
-        f"calibrated to nor given: {_counts_text(predicted)}."
+    lead = f"{TITLE}, by the twin with {study.plan.seed_count()} seeds a case."
+    title = f"Of {len(study.rows)} statements and numbers {_counts_text(every)}"
+    reason = (
+        f"Of the {sum(predicted.values())} that the twin was neither calibrated to nor given "
+        f"{_counts_text(predicted)}."
     )
+    tiles = [
+        Tile(f"{word}, of those predicted", str(count), f"{every[word]} of all")
+        for word, count in predicted.items()
+    ]
     disagreeing = [row for verdict in VERDICTS[:0:-1] for row in study.rows if row.verdict == verdict]
     write_page(
         path, "study.html.j2", "The source study, reproduced", lead=lead, provenance=provenance,
+        verdicts=[VerdictBox("doubtful" if disagreeing else "good", title, [reason])], tiles=tiles[:3],
         packages=TWIN_LIBRARIES, figures=_figures(study), noise=noise_sentence(study),
         tab4_heads=TAB4_HEAD, tab4=[(case.label, *table_cells(study, case)) for case in CASES],
         disagreement=[(*_statement(row), row.why) for row in disagreeing],

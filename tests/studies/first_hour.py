@@ -10,6 +10,7 @@ import argparse
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -79,10 +80,22 @@ def readme_python() -> str:
     return found[1]
 
 
+def picture(page: Path, file: Path) -> None:
+    """The head of a report as a browser shows it, where there is one."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        print("no picture: there is no chromium")
+        return
+    look = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1060,1240"]
+    look += [f"--user-data-dir={page.parent / 'browser'}", "--virtual-time-budget=12000"]
+    subprocess.run([browser, *look, f"--screenshot={file}", page.as_uri()], capture_output=True, timeout=120)
+
+
 def main() -> int:
     """Print a line and a screen a step; 1 where one failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", type=Path, help="an environment that has the package; default: a new one")
+    parser.add_argument("--out", type=Path, help="folder for report.png, the head of the demo's report")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -102,6 +115,8 @@ def main() -> int:
             printed = took.printed.replace(str(Path.home()), "~").strip().splitlines()
             more = ["..."] if len(printed) > SCREEN_LINES else []
             screens += ["", f"$ {command}", *(line[:118] for line in printed[:SCREEN_LINES]), *more]
+        if given.out is not None:
+            picture(folder / "demo-out" / "report.html", given.out.absolute() / "report.png")
         print("\n".join(lines))
         packages = env / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages"
         sizes = {path.name: megabytes(path) for path in packages.iterdir() if path.is_dir()}

@@ -18,7 +18,7 @@ PRODUCT = (
     Study(
         "first_hour",
         "How long is each step of the first hour, does it work after `pip install .`, and how large is it?",
-        module("first_hour"),
+        module("first_hour", "--out", OUT),
         6,
         {
             **{
@@ -28,6 +28,7 @@ PRODUCT = (
             "installed_mb": r"installed (\d+) MB",
             "failed": r"steps that failed: (\d+)",
         },
+        picture="report.png",
     ),
     Study(
         "ice_picture",

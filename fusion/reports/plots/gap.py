@@ -32,8 +32,8 @@ def plot_map(sheet: Sheet, d: GapDiagnosis) -> None:
     fig = plot.panel.figure
     fig.height += 110
     palette = Oranges256[::-1][20:]
-    edges = (np.arange(n + 1) - 0.5 for n in (len(columns), len(channels)))
-    plot.cells(*edges, share, palette, limits=(0.0, max(float(np.nanmax(share)), 1.0)))
+    x, y = (np.arange(-0.5, n) for n in (len(columns), len(channels)))
+    plot.cells(x, y, share, palette, limits=(0.0, max(float(np.nanmax(share)), 1.0)))
     sure = places[[c.p_value <= d.significance for c in d.where]].astype(float)
     if len(sure):
         plot.dots(sure[:, 0], sure[:, 1], "significant", "#1a1a1a", size=5.0)

@@ -183,6 +183,7 @@ def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
     for cells in made[0].rows:
         assert " | ".join(cells) in text
     page = (tmp_path / "report.html").read_text()
+    assert "targets are reached" in page
     assert page.count("<svg") + page.count("data:image/svg+xml") == 1
     assert (tmp_path / "ratios.png").stat().st_size > 5_000
     again = tmp_path / "again"

@@ -66,7 +66,6 @@ def test_its_files(demo: tuple[Path, str]) -> None:
         "log",
         "fixed",
         "adaptive",
-        "demo.png",
         "report.html",
         "config.json",
     }

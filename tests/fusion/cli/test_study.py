@@ -103,6 +103,7 @@ def test_the_report_is_one_file_with_all_figures(reproduced: tuple[Path, str]) -
     page = (folder / "report.html").read_text(encoding="utf-8")
     for number in (4, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15):
         assert f"Fig. {number}. " in page
+    assert re.search(r"<strong>Of \d+ statements and numbers \d+ agree", page)
     assert page.count("data:image/svg+xml") == page.count("<figure>") == 15
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert not re.search(r"\bnan\b", re.sub(r'src="data:[^"]*"', "", page))

@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 from jinja2 import UndefinedError
 
-from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.reports import page
+from terrafusion.fusion.reports.page import Tile, VerdictBox, need_matplotlib, write_page
 
 HOSTILE = "<script>alert('x')</script>"
 
@@ -35,3 +37,13 @@ def test_a_missing_value_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(UndefinedError, match="groups"):
         sweep_page(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_needs_matplotlib_says_so_before_it_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    need_matplotlib()
+    monkeypatch.setattr(page, "find_spec", lambda name: None)
+    with pytest.raises(TerrafusionError, match=r"pip install 'terrafusion\[plots\]'"):
+        need_matplotlib()
+    templates = Path(page.__file__).parent / "templates"
+    drawn = {path.name for path in templates.glob("*.html.j2") if "figure(" in path.read_text()}
+    assert drawn == {"benchmark.html.j2", "blind.html.j2", "study.html.j2", "macros.html.j2"}

@@ -33,11 +33,13 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
     for words in (
         f"{len(trials)} trials",
         "false alarms",
+        "targets are met, 0 missed",
         "Confusion",
         "wrong soil label",
         "opponent",
     ):
         assert words in page
+    assert page.count('class="tile"') == 3
     assert "://" not in page
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
     told = summary(scores)
