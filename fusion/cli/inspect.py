@@ -60,12 +60,19 @@ def inspect(
         from terrafusion.fusion.reports.inspect import write_inspection
 
         write_inspection(report, page, [text for _, text in lines], command_line())
-    done = "" if report is None else f"report: {report}"
+    done = _found(page) + ("" if report is None else f"; report: {report}")
     return Result(styled_lines(lines), done, page, int(_has_errors(page)))
 
 
 def _has_errors(page: dict[str, Any]) -> bool:
     return any(finding["severity"] == "error" for finding in page.get("findings", ()))
+
+
+def _found(page: dict[str, Any]) -> str:
+    """How many findings there are, in words."""
+    severities = [finding["severity"] for finding in page.get("findings", ())]
+    counts = [f"{n} {s}{'s' if n > 1 else ''}" for s in ("error", "warning") if (n := severities.count(s))]
+    return f"findings: {', '.join(counts) or 'none'}"
 
 
 def inspected(

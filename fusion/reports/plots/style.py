@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.metrics.scores import Outage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,7 +55,7 @@ TRUTH, HELD_OUT, NEUTRAL = "#1a1a1a", "#cc3311", "#7f7f7f"
 TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#e69f00"
 """The same where the background may be light or dark."""
 BEFORE, AFTER = "#d55e00", "#0072b2"
-OUTAGE, EXPECTED = "#ffe0b3", "#dddddd"
+EXPECTED = "#dddddd"
 LINE_LUMINANCE = (0.13, 0.29)
 """Relative luminance (WCAG 2.1) of lines that stand out on a light and on a dark page."""
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
@@ -106,24 +105,6 @@ def canvases(
     return fig, list(fig.subplots(rows, columns, sharex=sharex, squeeze=False).flat)
 
 
-def channel_grid(count: int, height: float, extra: float) -> tuple[Figure, list[Axes]]:
-    """Axes for `count` channels over time in two columns, `height` inches a row."""
-    rows = (count + 1) // 2
-    fig, axes = canvases(rows, (10.0, extra + height * rows), 2)
-    for ax in axes[count:]:
-        ax.set_axis_off()
-    return fig, axes[:count]
-
-
-def finish_grid(fig: Figure, axes: Sequence[Axes]) -> None:
-    """Time below the last row of a `channel_grid`, and one legend above it."""
-    for ax in axes[-2:]:
-        ax.set_xlabel("time, s", fontsize=9)
-        ax.tick_params(labelbottom=True)
-    handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside upper right", ncols=len(labels), fontsize=8, frameon=False)
-
-
 def format_axes(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     """Axis labels, a light grid and no box."""
     ax.set_xlabel(x, fontsize=9)
@@ -152,14 +133,6 @@ def line(ax: Axes, t_s: Array, values: Array, colour: str, label: str | None = N
     """A line, thinned to `MAX_POINTS`."""
     rows = thin(len(t_s))
     ax.plot(t_s[rows], values[rows], color=colour, label=label, **({"linewidth": 1.2} | options))
-
-
-def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:
-    """Shade the outages of GNSS; they are named once in the legend."""
-    for i, outage in enumerate(outages):
-        label = "no GNSS" if i == 0 else None
-        end = outage.start_s + outage.seconds
-        ax.axvspan(outage.start_s, end, color=OUTAGE, zorder=0, linewidth=0, label=label)
 
 
 def plain_log_ticks(axis: Axis) -> None:
