@@ -49,7 +49,7 @@ def inspect(
     Args:
         report (FILE.html): Also write this as a page.
     """
-    from terrafusion.fusion.cli.inspect_page import page_lines, styled_lines
+    from terrafusion.fusion.cli.inspect_page import contents_lines, page_lines, styled_lines
 
     load_rig(vehicle)
     HowRead(topic, stamps, columns, True).options(None)  # reports wrong usage for any kind of log
@@ -59,9 +59,10 @@ def inspect(
     if report is not None:
         from terrafusion.fusion.reports.inspect import write_inspection
 
-        write_inspection(report, page, [text for _, text in lines], command_line())
-    done = _found(page) + ("" if report is None else f"; report: {report}")
-    return Result(styled_lines(lines), done, page, int(_has_errors(page)))
+        contents = lines if trials else contents_lines(page)
+        write_inspection(report, page, [text for _, text in contents], command_line())
+    done = "" if report is None else f"report: {report}"
+    return Result(styled_lines(lines), done, page, int(_has_errors(page)), short=_found(page))
 
 
 def _has_errors(page: dict[str, Any]) -> bool:

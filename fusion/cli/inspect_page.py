@@ -38,6 +38,12 @@ def styled_lines(lines: Iterable[Line]) -> list[str]:
 
 def page_lines(page: dict[str, Any]) -> Iterator[Line]:
     """The whole page."""
+    yield from contents_lines(page)
+    yield from _findings(page)
+
+
+def contents_lines(page: dict[str, Any]) -> Iterator[Line]:
+    """The page without its findings."""
     yield from _title(page)
     yield from _channels(page["channels"])
     measured = list(measured_texts(page["measured"]))
@@ -47,7 +53,6 @@ def page_lines(page: dict[str, Any]) -> Iterator[Line]:
         yield from entry(name, "", text)
     for note in page["notes"]:
         yield from entry("note", "dim", _note(note, page["recordings"]))
-    yield from _findings(page)
 
 
 def _title(page: dict[str, Any]) -> Iterator[Line]:

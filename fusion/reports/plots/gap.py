@@ -137,7 +137,7 @@ def plot_shrink(sheet: Sheet, d: GapDiagnosis) -> None:
     plot.glyph("segment", ends, "", style.NEUTRAL, "line", line_width=2)
     for label, colour, marker, k in arms:
         values = np.array([np.nan if row[k] is None else row[k] for row in rows], dtype=float)
-        plot.dots(values, at, label, colour, marker, 9.0)
+        plot.dots(values, at, label, colour, marker, 14.0 if marker == "ring" else 9.0)
 
 
 def plot_errors(sheet: Sheet, d: GapDiagnosis, run: int) -> list[str]:

@@ -159,13 +159,17 @@ def test_inspect_fails_where_a_finding_is_an_error(here: Path, good_log: Path, t
         row[column] = "1e9"
     (here / "log" / "imu.csv").write_text("\n".join([rows[0], *map(",".join, cells)]) + "\n")
     done = terrafusion("inspect", "log", "--json")
-    assert (done.status, done.err) == (1, "")
+    assert done.status == 1
+    assert re.fullmatch(r"findings: \d+ errors?.*\n", done.err)
     assert any(finding["severity"] == "error" for finding in json.loads(done.out)["findings"])
     for _ in range(2):
         assert terrafusion("inspect", "log", "--report", "log.html").out.endswith("report: log.html\n")
     page = (here / "log.html").read_text()
     assert "beyond anything possible" in page
     assert "gyro_z_radps" in page
+    assert page.count("beyond anything possible") == 1
+    assert re.search(r'class="verdict not_to_be_used">\s*<p><strong>\d+ errors? and', page)
+    assert re.fullmatch(r"findings: \d+ errors?.*", terrafusion("inspect", "log", "--quiet").out.strip())
     (here / "mine.html").write_text("mine")
     assert terrafusion("inspect", "log", "--report", "mine.html").refused("mine.html", "exists", "--force")
 
