@@ -70,7 +70,7 @@ def benchmark(
 
     Raises:
         ConfigError: an unknown family.
-        TerrafusionError: nothing to run, workers died, no matplotlib, or the folder cannot be written.
+        TerrafusionError: nothing to run, workers died, or the folder cannot be written.
     """
     import dataclasses
 
@@ -79,9 +79,7 @@ def benchmark(
     from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import at_the_end, origin_of, write_benchmark
-    from terrafusion.fusion.reports.page import need_matplotlib
 
-    need_matplotlib()
     plan = BenchmarkPlan(families_of(list(only)), seeds, quick)
     origin = origin_of(plan, "terrafusion.benchmark")
     result = run_benchmark(plan, Path(out), jobs=jobs, backend=backend, address=address, progress=progress)

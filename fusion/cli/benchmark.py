@@ -59,10 +59,8 @@ def benchmark(
         write_benchmark,
         write_document,
     )
-    from terrafusion.fusion.reports.page import need_matplotlib
 
     check_backend(backend, address)
-    need_matplotlib()
     plan = BenchmarkPlan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
     words += [f"--seeds {seeds}"] if seeds else []

@@ -69,7 +69,6 @@ def gap_blind(
         quick: A small subset: every family, few trials.
     """
     from terrafusion.fusion.reports.blind import summary, write_blind
-    from terrafusion.fusion.reports.page import need_matplotlib
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.answers import Pool
     from terrafusion.twin.gap.blind.check import run_blind_check
@@ -79,7 +78,6 @@ def gap_blind(
     if quick and share < 1.0:
         raise typer.BadParameter("a quick check has its own size", param_hint="--share")
     check_backend(backend, address)
-    need_matplotlib()
     # Processes, or threads inside.
     judged = partial(diagnose, jobs=1) if jobs > 1 or backend == "dask" else diagnose
     with progress_bar("diagnosing") as progress:

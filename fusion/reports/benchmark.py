@@ -2,7 +2,7 @@
 
 benchmark.json   every row, comparison and target, with its provenance
 benchmark.md     the tables; with `--docs` also the document made of them
-ratios.png       the figure
+ratios.png       the figure, where matplotlib is installed
 report.html      tables and figure in one page
 parts/           the rows of single jobs, from which a stopped run continues
 """
@@ -28,7 +28,7 @@ from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports.benchmark_tables import Section, tables
-from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page, write_png, write_text
+from terrafusion.fusion.reports.page import Tile, VerdictBox, drawn, write_page, write_png, write_text
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 SCHEMA = "terrafusion.benchmark/1"
@@ -48,8 +48,9 @@ def write_benchmark(out: Path, result: BenchmarkResult, origin: Mapping[str, str
     sections = tables(result.rows)
     write_text(out / "benchmark.json", to_json(_content(result, origin), indent=1) + "\n")
     write_text(out / "benchmark.md", "\n".join(document_lines(sections, result, origin)) + "\n")
-    ratios, judged = plot_ratios(contrasts(result.rows)), targets(result.rows)
-    write_png(out / "ratios.png", ratios, dpi=110)
+    ratios, judged = drawn(lambda: plot_ratios(contrasts(result.rows))), targets(result.rows)
+    if ratios is not None:
+        write_png(out / "ratios.png", ratios, dpi=110)
     write_page(
         out / "report.html", "benchmark.html.j2", "Fixed against adaptive weighting",
         verdicts=[_verdict(judged)], tiles=_tiles(judged), provenance=origin, packages=LIBRARIES,

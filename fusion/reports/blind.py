@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_png
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, drawn, write_page, write_png
 from terrafusion.fusion.reports.plots import blind as plots
 
 Scores = Mapping[str, Any]
@@ -15,13 +15,14 @@ MET = {True: "met", False: "missed", None: ""}
 
 
 def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | None = None) -> None:
-    """`report.html` and `sheet.png` in the folder `out`.
+    """`report.html` and, where matplotlib is installed, `sheet.png` in the folder `out`.
 
     Raises:
         TerrafusionError: the folder cannot be written.
     """
-    sheet = plots.plot_sheet(scores)
-    write_png(out / "sheet.png", sheet)
+    sheet = drawn(lambda: plots.plot_sheet(scores))
+    if sheet is not None:
+        write_png(out / "sheet.png", sheet)
     own = scores["figures"]["diagnosis"]
     lead = (
         f"{len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
@@ -49,7 +50,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
                 own["false_alarms"][setting], effects["power"], effects["right"]))]
             for setting, effects in own["settings"].items()
         ],
-        confusion=plots.plot_confusion(own["confusion"]),
+        confusion=drawn(lambda: plots.plot_confusion(own["confusion"])),
     )  # fmt: skip
 
 

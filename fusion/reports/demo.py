@@ -10,9 +10,10 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
-from terrafusion.fusion.reports.plots.sheet import Sheet
+from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
 
 FIXED, ADAPTIVE = "fixed", "adaptive"
+ODOM = "#009e73"
 EQUAL, EQUAL_M = 0.05, 0.005
 """Differences, relative and in metres, below which two errors count as equal: the table shows centimetres."""
 
@@ -95,7 +96,9 @@ def _listed(rows: Sequence[str]) -> str:
 
 
 def plot_drives(sheet: Sheet, runs: Sequence[DemoRun]) -> None:
-    """Position error of all drives over time, median and range of each mode."""
+    """Position error of all drives over time, median and range of each mode, and onto the map the path of the
+    first drive in the odometry frame.
+    """
     plot = sheet.add_time("drives", f"position error of {len(runs) // 2} drives, m", 260)
     for mode in (FIXED, ADAPTIVE):
         own = [run for run in runs if run.mode == mode]
@@ -105,3 +108,6 @@ def plot_drives(sheet: Sheet, runs: Sequence[DemoRun]) -> None:
         band = {"x": t_s, "y1": np.nanmin(errors, 0), "y2": np.nanmax(errors, 0)}
         plot.glyph("varea", band, f"{mode}: range", colour, "area", alpha=0.2)
         plot.line(t_s, np.nanmedian(errors, 0), f"{mode}: median", colour)
+    first = min((run for run in runs if run.mode == ADAPTIVE), key=lambda run: run.seed)
+    label = f"{ADAPTIVE}, odometry frame"
+    Plot("map", sheet.panels["map"]).line(*first.odom_m.T, label, ODOM, dash="dashed", width=1.0)

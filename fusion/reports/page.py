@@ -10,7 +10,7 @@ import base64
 import io
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -93,6 +93,11 @@ def need_matplotlib() -> None:
         raise TerrafusionError(
             "the package matplotlib is not installed", remedy="pip install 'terrafusion[plots]'"
         )
+
+
+def drawn(draw: Callable[[], Figure]) -> Figure | None:
+    """A picture, or None where matplotlib is not installed: the page then says how to get it."""
+    return None if find_spec("matplotlib") is None else draw()
 
 
 def write_png(path: Path, fig: Figure, dpi: int = 150) -> Path:

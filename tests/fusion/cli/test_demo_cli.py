@@ -52,6 +52,11 @@ def test_the_comparison_is_printed(demo: tuple[Path, str]) -> None:
     )
 
 
+def test_the_map_shows_the_path_in_the_odometry_frame(demo: tuple[Path, str]) -> None:
+    folder, _ = demo
+    assert 'data-series="map/adaptive, odometry frame"' in (folder / "report.html").read_text()
+
+
 def test_the_odometry_frame_does_not_jump_where_gnss_comes_back(demo: tuple[Path, str]) -> None:
     """A step takes a tenth of a second at 1.1 m/s; the map is corrected by more than that."""
     _, out = demo

@@ -44,6 +44,7 @@ def test_what_needs_matplotlib_says_so_before_it_computes(monkeypatch: pytest.Mo
     monkeypatch.setattr(page, "find_spec", lambda name: None)
     with pytest.raises(TerrafusionError, match=r"pip install 'terrafusion\[plots\]'"):
         need_matplotlib()
+    assert page.drawn(lambda: pytest.fail("drawn")) is None
     templates = Path(page.__file__).parent / "templates"
     drawn = {path.name for path in templates.glob("*.html.j2") if "figure(" in path.read_text()}
     assert drawn == {"benchmark.html.j2", "blind.html.j2", "study.html.j2", "macros.html.j2"}
