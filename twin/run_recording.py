@@ -113,9 +113,7 @@ def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | Vehicle
     if not isinstance(vehicle, VehicleParams):
         parts.insert(0, ("vehicle", "vehicles", str(vehicle)))
     counts = {(kind, name): assumed(folder, name) for kind, folder, name in parts}
-    listed = [
-        f"{n} of {whole} numbers of {kind} '{name}'" for (kind, name), (n, whole) in counts.items() if n
-    ]
+    listed = [f"{n} of {whole} of {kind} '{name}'" for (kind, name), (n, whole) in counts.items() if n]
     if listed:
-        notes.append(f"assumed, as their sources say: {', '.join(listed)}")
+        notes.append(f"assumed numbers, marked in their files: {', '.join(listed)}")
     return notes

@@ -183,14 +183,15 @@ def parse_prior(text: str) -> tuple[str, Prior]:
 
 def summary(found: Calibration) -> list[str]:
     """The result in a few lines of text."""
-    from terrafusion.twin.calibrate.identifiability import IDENTIFIED
+    from terrafusion.twin.calibrate.identifiability import COMBINED, IDENTIFIED, NOT_IDENTIFIED
 
+    words = {COMBINED: "identified only in combination", NOT_IDENTIFIED: "not identified"}
     width = max(len(f.name) for f in found.fitted)
     count = len(found.sensor_errors)
     logs = f"{count} log{'s' if count > 1 else ''}, {found.seconds_of_data:.0f} s"
     lines = [f"{found.model.vehicle.name}, {logs}; {found.sentence}"]
     for f in found.fitted:
-        status = "" if f.status == IDENTIFIED else f"   {f.status}"
+        status = "" if f.status == IDENTIFIED else f"   {words[f.status]}"
         status += "" if found.converged() else "   sigma not valid"
         lines.append(
             f"{f.name:{width}s}  {f.value:.5g} +- {f.sigma:.2g} {f.unit}".rstrip()

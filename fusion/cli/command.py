@@ -159,6 +159,7 @@ def _own_options(
 def _described(docstring: str) -> tuple[str, dict[str, Any]]:
     """A command's help without the section `Args` of its docstring, and the options that this describes."""
     about, _, section = inspect.cleandoc(docstring).partition("\n\nArgs:\n")
+    about = re.sub(r"(\S)\n(?=\S)", r"\1 ", about)  # the width of the terminal breaks its lines
     entries = re.findall(r"^    (\w+)(?: \((.+?)\))?: (.+(?:\n {8}.+)*)", section, re.MULTILINE)
     return about, {
         name: typer.Option(

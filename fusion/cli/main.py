@@ -67,27 +67,27 @@ def options(
 
 
 add_command(app, "demo", demo.demo, output=demo.OUTPUT)
+add_command(app, "self-check", self_check.self_check)
 add_command(app, "init", init.init, files={"out": None}, as_json=False)
 add_command(app, "inspect", inspect.inspect, files={"report": "terrafusion inspect"})
-add_command(app, "fetch", fetch.fetch)
-add_command(app, "convert", convert.convert, output=convert.OUTPUT)
-add_command(app, "simulate", simulate.simulate, output=simulate.OUTPUT)
-add_command(app, "sweep", sweep.sweep, output=sweep.OUTPUT)
-add_command(app, "benchmark", benchmark.benchmark, output=benchmark.OUTPUT)
+add_command(app, "replay", replay.replay, output=replay.OUTPUT, files={"rerun": None})
+add_command(app, "live", live.live, as_json=False)
 add_command(
     app, "calibrate", calibrate.calibrate, output=calibrate.OUTPUT,
     instead=("sensors", calibrate.SENSORS_OUTPUT),
 )  # fmt: skip
 add_command(app, "gap", gap.gap, output=gap.OUTPUT, files={"write_vehicle": "gap diagnosis:"})
-add_command(app, "gap-blind", gap_blind.gap_blind, output=gap_blind.OUTPUT)
+add_command(app, "simulate", simulate.simulate, output=simulate.OUTPUT)
+add_command(app, "sweep", sweep.sweep, output=sweep.OUTPUT)
+add_command(app, "convert", convert.convert, output=convert.OUTPUT)
+add_command(app, "fetch", fetch.fetch)
 add_command(app, "allan", allan.allan, as_json=False)
-add_command(app, "study", study.study, output=study.OUTPUT)
-add_command(app, "replay", replay.replay, output=replay.OUTPUT, files={"rerun": None})
-add_command(app, "self-check", self_check.self_check)
-add_command(app, "completion", completion.completion, as_json=False)
-add_command(app, "live", live.live, as_json=False)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")
+add_command(app, "study", study.study, output=study.OUTPUT)
+add_command(app, "benchmark", benchmark.benchmark, output=benchmark.OUTPUT)
+add_command(app, "gap-blind", gap_blind.gap_blind, output=gap_blind.OUTPUT)
+add_command(app, "completion", completion.completion, as_json=False)
 
 
 def main() -> None:

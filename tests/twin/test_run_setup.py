@@ -154,9 +154,9 @@ def test_patches_and_varying_strength_are_reported(tmp_path) -> None:
 
 def test_what_is_assumed_is_noted() -> None:
     (note,) = simulate("straight", terrain="mud").notes
-    assert note.startswith("assumed, as their sources say: ")
-    assert "numbers of vehicle 'elevate'" in note
-    assert "numbers of terrain 'mud'" in note
+    assert note.startswith("assumed numbers, marked in their files: ")
+    assert "of vehicle 'elevate'" in note
+    assert "of terrain 'mud'" in note
     assert not any("vehicle" in note for note in simulate("straight", vehicle=ELEVATE).notes)
 
 

@@ -47,7 +47,7 @@ def test_options_reach_the_run_and_the_log_holds_it(tmp_path: Path) -> None:
     assert "W mean" in lines[2]
     assert "% slip" in lines[2]
     assert lines[3] == "not immobilised"
-    assert any(line.startswith("assumed, as their sources say: ") for line in lines)
+    assert any(line.startswith("assumed numbers, marked in their files: ") for line in lines)
     assert lines[-1] == "written to log"
     log = open_recording(tmp_path / "log")
     assert log.imu is not None

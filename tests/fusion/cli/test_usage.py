@@ -45,6 +45,16 @@ def test_help(words: str, terrafusion) -> None:
     assert "-h" in outcome.out
 
 
+def test_paragraphs_of_help_are_broken_by_the_terminal_alone(terrafusion) -> None:
+    lines = terrafusion("init", "-h").out.splitlines()
+    first = next(i for i, line in enumerate(lines) if "Lists what the log holds" in line)
+    paragraph = [
+        line.strip() for line in lines[first : lines.index(next(x for x in lines if "Example" in x))]
+    ]
+    full = [line for line in paragraph if line][:-1]
+    assert all(len(line) > 55 for line in full), full
+
+
 def test_help_loads_no_heavy_package() -> None:
     code = (
         "import sys; from terrafusion.fusion.cli.main import main; sys.argv = ['terrafusion', '--help']\n"
