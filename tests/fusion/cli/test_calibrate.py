@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
+from tests.fusion.reports.browser import assert_drawn
 
 NAMES = "soil.resistance.rolling,vehicle.wheel.radius_m,vehicle.body.cg_height_m"
 
@@ -46,6 +47,7 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
     assert "vehicle.body.cg_height_m is not identified by this data" in page
     assert page.count("<figure>") == 2 + len({c["channel"] for c in found["channels"]})
     assert "default-src 'none'" in page  # the browser itself refuses any request
+    assert_drawn(out / "report.html")
 
 
 def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.reports.gap_text import effect_words
+from tests.fusion.reports.browser import assert_drawn
 from tests.twin.gap.runs import runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
@@ -48,6 +49,7 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     assert keys[:5] == ["path0", "path1", "where", "causes", "shrink"]
     assert {key.split("_")[0] for key in keys[5:]} == {"error0", "error1"}
     assert page.count('class="tile"') == 3
+    assert_drawn(tmp_path / "out" / "report.html")
     assert "Before and after" in page
     lines = done.out.splitlines()
     assert lines[0].startswith("Gap caused by wheel_radius or grousers (")

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.fusion.reports.browser import assert_drawn
+
 SWEEP = """\
 description: climbing <sand> & co
 scenario: drive.yaml
@@ -50,6 +52,7 @@ def test_a_sweep_leaves_table_report_and_plots(terrafusion: Any, file: Path) -> 
     assert re.search(r"Slope, deg: \d+ % of the runs are mobile at 0, \d+ % at 15\.", page)
     assert json.loads(Path("out/sweep.json").read_text())["sha256"] in page
     assert "default-src 'none'" in page  # the browser itself refuses any request
+    assert_drawn(Path("out/report.html"))
 
 
 def test_no_plots_and_recordings_of_chosen_runs(terrafusion: Any, file: Path) -> None:
