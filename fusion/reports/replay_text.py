@@ -184,21 +184,16 @@ def verdicts(names: Sequence[str], runs: Sequence[Metrics]) -> list[VerdictBox]:
 
 
 def summary_of_one(metrics: Metrics) -> list[str]:
-    """The opening sentences of a report on one run."""
+    """The opening sentences of a report on one run: what the verdict and the three numbers do not say."""
     sentences = [
         f"The log {metrics['log']} lasts {number(metrics['duration_s'])} s; the vehicle is "
         f"{metrics['vehicle']}. It was replayed with {metrics['mode']} weighting at "
         f"{number(metrics['realtime_factor'], 2)} times real time, over an estimated "
         f"{number(metrics['distance_m'])} m."
     ]
-    if metrics["ate_m"] is not None:
-        error, reference = number(metrics["ate_m"], 2), REFERENCE[metrics["against"]]
-        sentences.append(f"Against {reference}, the horizontal position error is {error} m RMS.")
-    elif metrics["against"] is None:
+    if metrics["ate_m"] is None and metrics["against"] is None:
         sentences.append("The log has neither truth nor enough GNSS fixes: the accuracy could not be scored.")
     sentences += [_outage_sentence(outage) for outage in metrics["outages"]]
-    if metrics["nees_mean"] is not None:
-        sentences.append(_consistency_sentence(metrics["nees_mean"]))
     if metrics["terrain"]:
         ranked = sorted(metrics["terrain"].items(), key=lambda item: -item[1])
         shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in ranked if share >= 0.005)
@@ -262,13 +257,3 @@ def _outage_sentence(outage: Mapping[str, Any]) -> str:
         f"{name} the position was {number(outage['end_error_m'], 2)} m off at the end, "
         f"after {number(outage['distance_m'])} m{share}."
     )
-
-
-def _consistency_sentence(nees: float) -> str:
-    if nees > 2.0:
-        verdict = "the estimator is overconfident"
-    elif nees < 0.5:
-        verdict = "the estimator is cautious"
-    else:
-        verdict = "the estimated uncertainty fits the errors"
-    return f"NEES per dimension of the position is {number(nees, 2)} (1 is consistent): {verdict}."
