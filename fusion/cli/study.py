@@ -47,13 +47,11 @@ def study(
         quick: Two seeds and a small batch.
         bags: Also write the three runs as ROS 2 bags (MCAP).
     """
-    from terrafusion.fusion.reports.page import need_matplotlib
     from terrafusion.fusion.reports.study import write_bags, write_plan, write_study
     from terrafusion.twin.study.study import StudyPlan, run_study
     from terrafusion.twin.study.text import study_lines
 
     check_backend(backend, address)
-    need_matplotlib()
     plan = StudyPlan(seeds=seeds, quick=quick, jobs=processes(jobs))
     write_plan(out, plan)
     with progress_bar("study") as progress:

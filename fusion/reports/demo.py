@@ -110,4 +110,5 @@ def plot_drives(sheet: Sheet, runs: Sequence[DemoRun]) -> None:
         plot.line(t_s, np.nanmedian(errors, 0), f"{mode}: median", colour)
     first = min((run for run in runs if run.mode == ADAPTIVE), key=lambda run: run.seed)
     label = f"{ADAPTIVE}, odometry frame"
-    Plot("map", sheet.panels["map"]).line(*first.odom_m.T, label, ODOM, dash="dashed", width=1.0)
+    x, y = first.odom_m.T
+    Plot("map", sheet.panels["map"]).line(x, y, label, ODOM, dash="dashed", width=1.0)

@@ -16,9 +16,8 @@ from functools import cache
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.tables import number
 
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.figure import Figure
 
+T = TypeVar("T")
 LIBRARIES = ("gtsam", "numpy", "scipy")
 TWIN_LIBRARIES = ("casadi", "numpy", "scipy")
 _PATH_DATA = re.compile(rb' d="[^"]*"')
@@ -83,20 +83,8 @@ def write_text(path: Path, text: str) -> Path:
     return write_atomically(path, lambda part: part.write_text(text, "utf-8", "backslashreplace"))
 
 
-def need_matplotlib() -> None:
-    """Refuse to make a report whose pictures need matplotlib, before hours of computing.
-
-    Raises:
-        TerrafusionError: it is not installed.
-    """
-    if find_spec("matplotlib") is None:
-        raise TerrafusionError(
-            "the package matplotlib is not installed", remedy="pip install 'terrafusion[plots]'"
-        )
-
-
-def drawn(draw: Callable[[], Figure]) -> Figure | None:
-    """A picture, or None where matplotlib is not installed: the page then says how to get it."""
+def drawn(draw: Callable[[], T]) -> T | None:
+    """Pictures, or None where matplotlib is not installed: the page then says how to get it."""
     return None if find_spec("matplotlib") is None else draw()
 
 

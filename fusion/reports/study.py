@@ -13,12 +13,13 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.core.json_text import finite, to_json
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, drawn, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
 from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
@@ -137,7 +138,8 @@ def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | Non
     write_page(
         path, "study.html.j2", "The source study, reproduced", lead=lead, provenance=provenance,
         verdicts=[VerdictBox("doubtful" if disagreeing else "good", title, [reason])], tiles=tiles[:3],
-        packages=TWIN_LIBRARIES, figures=_figures(study), noise=noise_sentence(study),
+        packages=TWIN_LIBRARIES, figures=drawn(lambda: _figures(study)) or defaultdict(lambda: None),
+        noise=noise_sentence(study),
         tab4_heads=TAB4_HEAD, tab4=[(case.label, *table_cells(study, case)) for case in CASES],
         disagreement=[(*_statement(row), row.why) for row in disagreeing],
         agreement=[(*_statement(row), row.criterion, row.why) for row in study.rows],

@@ -66,7 +66,7 @@ def odd_files(tmp_path: Path) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def without_matplotlib(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Commands do without the extra `plots`, but for those that say that they need it."""
+    """Commands do without the extra `plots`, but for the pictures of `study`."""
     with pytest.MonkeyPatch.context() as patch:
         if not request.module.__name__.endswith("test_study"):
             patch.setitem(sys.modules, "matplotlib", None)
