@@ -39,7 +39,7 @@ WEIGHTS = ("tests/fusion/weighting/test_weights.py",)
 MODES = "tests/fusion/weighting/test_modes.py::"
 TARGETS = {
     "fusion/graph/wheel_factor.py": (*GRAPH, "tests/fusion/graph/test_wheel_factor.py"),
-    "fusion/graph/gnss_factor.py": GRAPH,
+    "fusion/graph/gnss_factor.py": (*GRAPH, "tests/fusion/graph/test_gnss_factor.py"),
     "fusion/graph/slow_states.py": (*GRAPH, "tests/fusion/graph/test_slow_states.py"),
     "fusion/graph/chain.py": GRAPH,
     "twin/physics/wheel.py": PHYSICS,

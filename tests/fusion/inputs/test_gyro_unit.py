@@ -61,7 +61,7 @@ def test_it_needs_some_turns_that_agree() -> None:
         turned(57.3, 2 * WINDOWS)
     with pytest.raises(DataError, match="deg/s"):
         turned(-30.0, 2 * WINDOWS)
-    assert not turned(8.0, 40).in_degrees
+    assert not turned(9.8, 40).in_degrees
     assert not turned(57.3, 40, turn_radps=0.01).in_degrees, "wheels that hardly turn show nothing"
     assert not turned(0.0, 40, noise_radps=10.0).in_degrees, "noise has no one sign"
 

@@ -278,6 +278,9 @@ def test_soil_held_at_rest_damps_and_a_rolling_wheel_meets_fresh_soil() -> None:
             contact(on, LOAD_N, r, (0.0, 0.0), (x, 0.0), 0.0, 0.0, SMOOTH) for r, x in ((rim, 1e-3), (0.0, j))
         )
         assert float(moving.traction_x_n) == pytest.approx(float(same.traction_x_n), rel=2e-3)
+    aside = contact(on, LOAD_N, 0.0, (0.0, 1e-4), (0.0, -1e-3), 0.0, 0.0, SMOOTH)
+    held = contact(on, LOAD_N, 0.0, (0.0, 0.0), (0.0, -1e-3 - 0.03e-4), 0.0, 0.0, SMOOTH)
+    assert float(aside.traction_y_n) == pytest.approx(float(held.traction_y_n), rel=1e-4)
 
 
 def test_a_bristle_deflects_within_a_centimetre_of_travel() -> None:

@@ -160,3 +160,8 @@ def test_deviations_are_likelihood_ratios() -> None:
         ratios = [normal(zero, S + s**2 * n @ n.T).pdf(y) / normal(zero, S).pdf(y) for s in UNKNOWN_SIZES]
         wanted.append(2.0 * np.log(np.mean(ratios)))
         np.testing.assert_allclose(row, np.maximum(wanted, 0.0), rtol=1e-6, atol=1e-9)
+
+
+def test_beyond_all_replicates_the_p_value_goes_on_falling() -> None:
+    large, larger = (p_value(3, "reference", effect=size) for size in (30.0, 300.0))
+    assert larger < large < 1.0 / 1001.0
