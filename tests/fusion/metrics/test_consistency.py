@@ -272,12 +272,12 @@ def test_correlation_has_no_unit():
 
 
 def test_rows_that_are_not_chosen_are_no_part_of_the_correlation():
-    values = np.random.default_rng(4).normal(size=(40, 1))
+    values = gauss_markov(40, 0.9, np.random.default_rng(4), columns=1)
     rows = np.arange(40) % 3 != 0
     x = values[:, 0] * rows
     sums, pairs = (np.array([a[: 40 - k] @ a[k:] for k in range(4)]) for a in (x, rows.astype(float)))
     found = c.squared_correlation(values, rows)[:4]
-    assert found[0] == pytest.approx(1.0)
+    assert (found[:2] > 0.0).all()
     rho = sums * pairs[0] / (sums[0] * pairs)
     np.testing.assert_allclose(found[found > 0.0], (rho**2)[found > 0.0])
     np.testing.assert_allclose(c.squared_correlation(values + 9.0 * ~rows[:, None], rows)[:4], found)

@@ -417,3 +417,10 @@ def test_a_start_is_aligned_by_its_heading_or_by_least_squares(heading):
     assert np.isfinite(moved.velocity_error_mps).all() == heading  # of fixes: east-north of another frame
     said = "its first position and the mean heading over its first metre"
     assert how == (said if heading else "a least-squares fit over the first 3.0 m")
+
+
+def test_a_heading_that_drifts_after_the_first_metre_turns_nothing():
+    errors = straight(heading=True)
+    yaw = errors.estimate_yaw_rad + 0.5 * (np.arange(5) > 2)  # more than a metre on
+    moved, _ = align_start(dataclasses.replace(errors, estimate_yaw_rad=yaw))
+    assert moved.estimate_yaw_rad == pytest.approx([0.0, 0.0, 0.0, 0.5, 0.5], abs=1e-9)
