@@ -46,10 +46,8 @@ PRODUCT = (
     Study(
         "fuzz",
         "Does any input of readers, YAML, live API or command line end in a crash or a hang?",
-        module(
-            "fuzz", "--readers", "4000", "--yaml", "2000", "--live", "2000", "--cli", "2000", "--out", OUT
-        ),
-        40,
+        module("fuzz", "--readers", "5000", "--yaml", "4500", "--live", "200", "--cli", "300", "--out", OUT),
+        12,
         {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
     ),
     Study(
