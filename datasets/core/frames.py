@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.errors import DataError
 
+NEAREST_TO_POLE_DEG = 1e-6
+"""A tenth of a metre: no direction is east there."""
 GRAVITY_MPS2 = 9.80665
 """Standard gravity (3rd CGPM, 1901), m/s2."""
 
@@ -66,20 +69,28 @@ def yaw_of(q_xyzw: ArrayLike) -> Array:
 
 
 def geodetic_to_enu(lat_lon_height: ArrayLike, datum: ArrayLike) -> Array:
-    """ENU positions (N, 3), m, of WGS-84 (latitude deg, longitude deg, ellipsoidal height m), (N, 3)."""
+    """ENU positions (N, 3), m, of WGS-84 (latitude deg, longitude deg, ellipsoidal height m), (N, 3).
+
+    Raises:
+        DataError: the datum lies on a pole.
+    """
     import pymap3d
 
     llh = np.atleast_2d(np.asarray(lat_lon_height, dtype=float))
-    lat0, lon0, height0 = (float(x) for x in np.asarray(datum, dtype=float))
+    lat0, lon0, height0 = _off_the_poles(datum)
     return np.stack(pymap3d.geodetic2enu(llh[:, 0], llh[:, 1], llh[:, 2], lat0, lon0, height0), axis=-1)
 
 
 def enu_to_geodetic(enu_m: ArrayLike, datum: ArrayLike) -> Array:
-    """WGS-84 latitude, longitude (deg) and height (m), (N, 3), of ENU positions (N, 3) about `datum`."""
+    """WGS-84 latitude, longitude (deg) and height (m), (N, 3), of ENU positions (N, 3) about `datum`.
+
+    Raises:
+        DataError: the datum lies on a pole.
+    """
     import pymap3d
 
     enu = np.atleast_2d(np.asarray(enu_m, dtype=float))
-    lat0, lon0, height0 = (float(x) for x in np.asarray(datum, dtype=float))
+    lat0, lon0, height0 = _off_the_poles(datum)
     return np.stack(pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], enu[:, 2], lat0, lon0, height0), axis=-1)
 
 
@@ -89,6 +100,9 @@ def enu_from_ecef(
     """ENU positions (N, 3) of WGS-84 ECEF positions (N, 3), and the rotation (3, 3) of ECEF vectors to ENU.
 
     The third value is the datum: the one given, else the first position.
+
+    Raises:
+        DataError: the datum lies on a pole.
     """
     import pymap3d
 
@@ -96,9 +110,20 @@ def enu_from_ecef(
     if datum is None:
         latitude, longitude, height = (float(value) for value in pymap3d.ecef2geodetic(x[0], y[0], z[0]))
         datum = latitude, longitude, height
-    east, north, up = pymap3d.ecef2enu(x, y, z, *datum)
+    east, north, up = pymap3d.ecef2enu(x, y, z, *_off_the_poles(datum))
     columns = [pymap3d.ecef2enuv(*axis, datum[0], datum[1]) for axis in np.eye(3)]
     return np.stack([east, north, up], axis=-1), np.array(columns).T, datum
+
+
+def _off_the_poles(datum: ArrayLike) -> tuple[float, float, float]:
+    latitude, longitude, height = (float(value) for value in np.asarray(datum, dtype=float))
+    if abs(latitude) > 90.0 - NEAREST_TO_POLE_DEG:
+        raise DataError(
+            f"the datum lies on a pole ({latitude:.7g} deg), where no direction is east",
+            channel="gnss",
+            remedy="give a datum some metres away, or leave out fixes at a pole",
+        )
+    return latitude, longitude, height
 
 
 def gtsam_to_ros_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:

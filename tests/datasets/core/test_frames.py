@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core import frames
+from terrafusion.datasets.core.errors import DataError
 
 ANY_TIME = settings(deadline=None)
 ANGLES = st.floats(-math.pi, math.pi)
@@ -107,8 +108,18 @@ def test_earth_centred_positions_keep_their_distances(datum, enu) -> None:
 
 
 @pytest.mark.parametrize("latitude", [90.0, -90.0])
-def test_positions_come_back_about_a_pole(latitude: float) -> None:
-    """East is that of the datum's longitude there, and latitude falls whichever way one goes."""
+def test_a_datum_on_a_pole_is_refused(latitude: float) -> None:
+    pole, place = (latitude, 10.0, 0.0), [[3.0, 4.0, 0.0]]
+    for convert in (frames.enu_to_geodetic, frames.geodetic_to_enu):
+        with pytest.raises(DataError, match="pole"):
+            convert(place, pole)
+    with pytest.raises(DataError, match="pole"):
+        frames.enu_from_ecef([[0.0, 0.0, math.copysign(6_356_752.3, latitude)]])
+
+
+@pytest.mark.parametrize("latitude", [89.99999, -89.99999])
+def test_positions_come_back_a_metre_from_a_pole(latitude: float) -> None:
+    """Latitude falls whichever way one goes far enough."""
     pole, places = (latitude, 10.0, 0.0), np.array([[3.0, 4.0, 0.0], [-500.0, 20.0, 5.0]])
     llh = frames.enu_to_geodetic(places, pole)
     assert (np.abs(llh[:, 0]) < 90.0).all()
