@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.conventions import Conventions
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -57,7 +57,8 @@ class Format:
 
     def read(self, request: Request) -> Sequence[Recording]:
         """The recordings in the file."""
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are a finding, not a warning
+        # Huge numbers are a finding, not a warning.
+        with errors_of(request.path), np.errstate(over="ignore", invalid="ignore"):
             recordings: Sequence[Recording] = import_module(self.module).read(request)
         return recordings
 

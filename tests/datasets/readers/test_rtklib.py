@@ -78,6 +78,12 @@ def test_positions_come_back_to_the_millimetre(tmp_path: Path, datum: tuple[floa
     assert any("18 leap seconds" in note for note in recording.notes)
 
 
+def test_a_fix_on_a_pole_is_refused_with_the_name_of_the_file(tmp_path: Path) -> None:
+    llh = np.tile([90.0, 10.0, 2.0], (N, 1))
+    with pytest.raises(DataError, match=r"rover\.pos, gnss: the datum lies on a pole"):
+        open_recording(write(tmp_path, rows(llh)))
+
+
 @pytest.mark.parametrize("system", ["GPST", "UTC", "JST"])
 def test_time_systems(tmp_path: Path, system: str) -> None:
     header = f"%  {system}                  {COLUMNS}\n"
