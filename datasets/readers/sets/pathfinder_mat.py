@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
-from terrafusion.datasets.core.errors import DataError, errors_of
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.core.lag import lag_between
@@ -53,7 +53,7 @@ def read(request: Request) -> list[Recording]:
         DataError: the file is broken, a variable is missing, has other rows than its clock or
             claims an impossible size, or time runs backwards.
     """
-    with errors_of(request.path), opened(request.path) as file:
+    with opened(request.path) as file:
         return [_recording(file, request)]
 
 
