@@ -164,7 +164,7 @@ def test_a_published_soil_loads_in_si_and_can_be_driven_on(name) -> None:
     assert soil_vector(soil).shape == (len(SOIL_PARAMETERS),)
     run = simulate_run(SHORT, terrain=name, noiseless=True)
     assert run.recording.terrain_name == row["name"]
-    assert any(f"numbers of terrain '{name}'" in note for note in run.recording.notes)
+    assert any(f" of terrain '{name}'" in note for note in run.recording.notes)
 
 
 def test_library_soils_are_the_published_ones_they_name() -> None:
