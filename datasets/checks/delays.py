@@ -40,6 +40,8 @@ LEAST_LATE_S, SIGNIFICANT_S = 0.3, 0.2
 CALIBRATED_S = 3.0
 """Late fixes are no error up to this: the estimator finds such a delay by itself."""
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
+FOLLOWS_AFTER = (0.7, 1.0, 1.4, 2.0)
+"""Time constants that are tried, over the delay, which is shorter where changes are quick."""
 
 
 def check_clocks(context: CheckContext) -> Iterator[Finding]:
@@ -55,8 +57,13 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
         corrected = _on_one_clock(context)
         if corrected is not context:
             pairs = signal_pairs(CheckContext(without_stuck(corrected.recording), context.rig))
-        offsets = list(_offset_findings(corrected.recording, pairs))
-        yield from offsets or _late_fixes(corrected)
+        lags, dragged = sensor_lags(pairs)
+        off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
+        if off:
+            precise = {p for p, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[p]}
+            yield offset_finding(corrected.recording, off, precise | set(off))
+        elif not dragged:
+            yield from _late_fixes(corrected)
 
 
 def _on_one_clock(context: CheckContext) -> CheckContext:
@@ -71,20 +78,19 @@ def _on_one_clock(context: CheckContext) -> CheckContext:
     return dataclasses.replace(context, recording=recording)
 
 
-def _offset_findings(recording: Recording, pairs: SensorPairs) -> Iterator[Finding]:
-    """Sensors must report the same motion at the same time."""
-    lags = {}
+def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
+    """Lags between sensors of the same motion, and whether the body is dragged by wheels that slip."""
+    lags, dragged = {}, False
     for pair, signals in pairs.items():
         lag = far_lag(*signals)
         if lag is None or lag.r < LEAST_R:
             continue
         suspect = _matters(pair, lag, *signals)
-        if not suspect or not opposed(lag, *signals):
+        if suspect and pair[1] == "wheels" and lag.seconds < 0.0 and _follows(lag, *signals):
+            dragged = True
+        elif not suspect or not opposed(lag, *signals):
             lags[pair] = _without_smoothing(lag, *signals) if suspect and pair[1] == "wheels" else lag
-    off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
-    precise = {pair for pair, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[pair]}
-    if off:
-        yield offset_finding(recording, off, precise | set(off))
+    return lags, dragged
 
 
 def _late_fixes(context: CheckContext) -> Iterator[Finding]:
@@ -161,6 +167,25 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
     return dataclasses.replace(
         lag, seconds=lag.seconds - delay_s, low_s=lag.low_s - delay_s, high_s=lag.high_s - delay_s
     )
+
+
+def _follows(lag: Lag, body: Signal, wheels: Signal) -> bool:
+    """Whether the body follows its wheels as through a first-order lag, at least as well as by a pure delay.
+
+    Wheels that slip drag the body after them: quick changes arrive smaller and sooner than slow ones. Behind
+    a clock that is late all are delayed alike.
+    """
+    from scipy.signal import lfilter
+
+    grid, start = _common_grid(body, wheels)
+    a, a_known = _resampled(grid, body, start)
+    b, b_known = _resampled(grid, wheels, start)
+    later, later_known = _resampled(grid + lag.seconds, wheels, start)
+    known = a_known & b_known & later_known
+    decays = np.exp(-GRID_S / (np.array(FOLLOWS_AFTER) * abs(lag.seconds)))
+    dragged = (lfilter([1.0 - decay], [1.0, -decay], b) for decay in decays.tolist())
+    r = max(_correlation(a[known], one[known]) for one in dragged)
+    return r >= _correlation(a[known], later[known])
 
 
 def opposed(lag: Lag, one: Signal, other: Signal) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import CheckContext, Finding, repair, run_checks
-from terrafusion.datasets.checks.delays import offset_finding
+from terrafusion.datasets.checks.delays import offset_finding, sensor_lags
 from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag
@@ -396,3 +396,21 @@ def test_four_hundred_seconds_are_examined_quickly() -> None:
         assert found_in(r) == []
         took.append(time.process_time() - start)
     assert min(took) < 1.0
+
+
+@pytest.mark.parametrize("late_s", [0.25, 0.5])
+def test_a_body_that_its_wheels_drag_after_them_is_no_late_clock(late_s: float) -> None:
+    """Turns of random size; the body follows through a first-order lag, or by a clock that is late."""
+    rng, step_s = np.random.default_rng(4), 0.02
+    turns = np.repeat(rng.normal(0.0, 0.5, 100), 75)
+    wheels = np.convolve(turns, np.ones(25) / 25.0, "same")
+    dragged, share = np.zeros(len(wheels)), 1.0 - np.exp(-step_s / late_s)
+    for i in range(1, len(wheels)):
+        dragged[i] = dragged[i - 1] + share * (wheels[i] - dragged[i - 1])
+    delayed = np.roll(wheels, round(late_s / step_s))
+    t_ns = START_NS + np.arange(len(wheels)) * round(step_s * 1e9)
+    for body, follows in ((dragged, True), (delayed, False)):
+        body = body + rng.normal(0.0, 0.05, len(body))
+        lags, found = sensor_lags({("imu", "wheels"): ((t_ns, body), (t_ns, wheels))})
+        assert found is follows
+        assert list(lags) == ([] if follows else [("imu", "wheels")])
