@@ -78,7 +78,8 @@ def _tiles(c: Calibration) -> list[Tile]:
             f"median of {len(ratios)} channels, root mean square",
         ),
         Tile(
-            "largest change, prior sigmas", f"{(moved.value - moved.prior) / moved.prior_sigma:+.1f}",
+            "largest change, prior sigmas",
+            f"{round((moved.value - moved.prior) / moved.prior_sigma, 1) + 0.0:+.1f}",
             moved.name,
         ),
         Tile("data, s", f"{c.seconds_of_data:.0f}", f"of {count} log{'s' if count > 1 else ''}"),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MOST_FAILURES = 20
 MEANINGS = {
     "done": "drove on to the end",
-    "spinning": "turned their wheels, but drove less than a tenth of the commanded distance",
+    "spinning": "turned the wheels, but drove less than a tenth of the commanded distance",
     "immobilised": "stopped for good",
     "slid": "ended behind the start",
     "failed": "could not be computed",
