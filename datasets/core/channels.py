@@ -340,6 +340,7 @@ class Terrain(Channel):
     """
 
     name: ClassVar[str] = "terrain"
+    SAMPLE = TerrainSample
     label: NDArray[Any]
     source: str = "annotation"
     classes: tuple[str, ...] = ()

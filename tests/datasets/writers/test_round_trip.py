@@ -24,6 +24,7 @@ from terrafusion.datasets.core.channels import (
     Terrain,
     Wheels,
 )
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump, Overrides, Recording
 from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -139,7 +140,8 @@ def recordings(draw: st.DrawFn, latest_ns: int) -> Recording:
         vehicle=draw(st.none() | TEXTS),
         **found,
         datum=draw(
-            st.none() | st.tuples(st.floats(-90.0, 90.0), st.floats(-180.0, 180.0), st.floats(-1e3, 2e4))
+            st.none()
+            | st.tuples(st.floats(-89.9999, 89.9999), st.floats(-180.0, 180.0), st.floats(-1e3, 2e4))
         ),
         truth_channels=draw(truth),
         truth_frame=draw(st.sampled_from(["base", "antenna"])),
@@ -182,6 +184,15 @@ def test_any_recording_survives_the_mcap(recording: Recording) -> None:
         write_mcap(recording, Path(scratch) / "log.mcap")
         back = open_recording(Path(scratch) / "log.mcap")
     assert differences(recording, back) == []
+
+
+@pytest.mark.parametrize("latitude", [-90.0, 90.0])
+def test_the_mcap_refuses_a_datum_on_a_pole(latitude: float, tmp_path: Path) -> None:
+    gnss = Gnss(np.zeros(1, np.int64), np.zeros((1, 3)), np.ones((1, 3)), np.full(1, 4, np.uint8))
+    recording = Recording(name="pole", start_ns=0, gnss=gnss, datum=(latitude, 0.0, 0.0))
+    with pytest.raises(DataError, match="the datum lies on a pole"):
+        write_mcap(recording, tmp_path / "log.mcap")
+    assert list(tmp_path.iterdir()) == []
 
 
 FIELD_LOGS = (
