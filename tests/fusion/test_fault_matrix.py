@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
+from tests.studies.fault_matrix import matrix
 from tests.studies.fault_matrix.faults import FAULTS
-from tests.studies.fault_matrix.matrix import TWIN, Cell, clean_log, run, tried
+from tests.studies.fault_matrix.matrix import TWIN, Cell, clean_log, ended_after, run, tried
+from tests.studies.parts import TaskWorkers
 
 CRASHED = (12, 44)
 """Cells that ended in an exception once: an accelerometer in g, on a steered robot."""
@@ -15,12 +19,13 @@ CRASHED = (12, 44)
 
 def test_cells_fail_neither_loudly_nor_silently(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("TERRAFUSION_DATA", raising=False)
-    rows = run(len(FAULTS), 600.0, tmp_path, first=1000)
+    rows = run(len(FAULTS), TaskWorkers(limit_s=600.0), tmp_path, first=1000)
     assert {row["faults"][0] for row in rows} == set(FAULTS)
     bad = [row for row in rows if row["outcome"] not in ("ok", "warned", "refused", "slow")]
     assert not bad, bad
     assert sum(row["outcome"] == "refused" for row in rows) < len(rows) / 2
-    again = run(len(FAULTS), 0.0, tmp_path, first=1000)
+    monkeypatch.setattr(matrix, "tried", lambda cell: {})
+    again = run(len(FAULTS), TaskWorkers(), tmp_path, first=1000)
     assert [row["outcome"] for row in again] == [row["outcome"] for row in rows], "kept, not done again"
 
 
@@ -40,3 +45,20 @@ def test_a_fault_changes_the_log_alone_that_it_is_given() -> None:
         cell = Cell.drawn(number, TWIN)
         assert cell.faulty(log) is not log
     assert clean_log(TWIN[0]) is log
+
+
+def test_a_hang_is_ended_outside_the_main_thread_too() -> None:
+    ended = []
+
+    def hang() -> None:
+        try:
+            with ended_after(0.05):
+                for _ in range(1000):
+                    time.sleep(0.01)
+        except TimeoutError:
+            ended.append(True)
+
+    thread = threading.Thread(target=hang)
+    thread.start()
+    thread.join()
+    assert ended == [True]

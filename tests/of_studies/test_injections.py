@@ -42,6 +42,7 @@ from tests.studies.fault_injection.table import (
     table,
     verdict_on,
 )
+from tests.studies.parts import TaskWorkers
 
 HUSKY = load_vehicle("husky")
 RATE_HZ, SECONDS, SPEED_MPS, TURN_RADPS = 20, 60, 1.0, 0.2
@@ -239,25 +240,28 @@ def test_sums_count_what_was_judged() -> None:
 def test_a_stopped_table_goes_on_and_rows_of_other_candidates_do_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[float] = []
+    counter = tmp_path / "asked"
 
     def answer(source, logs, injection, severity, fold, effects):
-        asked.append(severity)
+        with counter.open("a") as asked:
+            asked.write(f"{severity:g} ")
         return {"skipped": "not tried"}
 
     monkeypatch.setattr(injections, "answered", answer)
     monkeypatch.setattr(injections, "SETS", {"one": None})
     monkeypatch.setattr(injections, "cases", lambda _: [("one", None, s, 0) for s in (1.0, 2.0)])
-    monkeypatch.setattr(Source, "of", classmethod(lambda *_: None))
-    injections.run(tmp_path, ["one"], None)
-    injections.run(tmp_path, ["one"], None)
-    assert asked == [1.0, 2.0]
-    path = tmp_path / "injections.jsonl"
-    path.write_text(path.read_text()[:-20])  # stopped in the midst of the last row
-    injections.run(tmp_path, ["one"], None)
-    assert asked == [1.0, 2.0, 2.0]
-    injections.run(tmp_path, ["one"], ("mass",))
-    assert asked == [1.0, 2.0, 2.0, 1.0, 2.0]
+    monkeypatch.setattr(injections, "source_of", lambda _: None)
+    one = TaskWorkers()
+    injections.run(tmp_path, ["one"], (), one)
+    injections.run(tmp_path, ["one"], (), one)
+    assert counter.read_text() == "1 2 "
+    next(p for p in (tmp_path / "parts").iterdir() if "2.0" in p.read_text()).unlink()
+    injections.run(tmp_path, ["one"], (), None)
+    assert counter.read_text() == "1 2 "
+    injections.run(tmp_path, ["one"], (), one)
+    assert counter.read_text() == "1 2 2 "
+    injections.run(tmp_path, ["one"], ("mass",), one)
+    assert counter.read_text() == "1 2 2 1 2 "
 
 
 def test_what_a_log_cannot_show_is_said() -> None:

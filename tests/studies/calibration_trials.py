@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +27,14 @@ from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 Array = NDArray[np.float64]
 
 VEHICLE, GROUND = "elevate", "asphalt"
 GROUNDS = (GROUND, "medium_sand", "loose_sand")
-"""Where the slip that acceleration asks for is measured, and the wheels' delay sought besides."""
+"""Where the slip that acceleration asks for is measured, and `ELSEWHERE` is sought besides."""
+ELSEWHERE = ("antenna_x_m", "wheel_delay_s", "gnss_delay_s")
 RADIUS_SHARE, ANTENNA_M, IMU_YAW_RAD, WHEEL_S, GNSS_S, TRACK_SHARE = (
     0.02,
     0.10,
@@ -153,53 +158,108 @@ def calibrated(recording: Recording) -> ReplayResult:
     return replay(recording, settings={"calibrate": True})
 
 
-def report(seeds: int) -> Iterator[str]:
-    """The tables, line by line."""
-    drives = {ground: _driven(exciting(ground), seeds) for ground in GROUNDS}
-    yield f"{seeds} seeds: expected; found; sigma; r.m.s. and largest error over sigma; sigma if dull"
+@functools.lru_cache(maxsize=8)
+def drive(ground: str, seed: int) -> Recording:
+    """The exciting drive on a ground, with one draw of its noise."""
+    return simulate(exciting(ground), vehicle=load_vehicle(VEHICLE), seed=seed)
+
+
+def sought(ground: str, state: str, seed: int) -> tuple[float, float]:
+    """Value and sigma of a state in a drive in which it is wrong."""
+    return found(calibrated(_fault(state).made(drive(ground, seed))), state)
+
+
+def unexcited(state: str) -> tuple[float, float]:
+    """The same in a drive that does not show it."""
     straight = simulate(dull(), vehicle=load_vehicle(VEHICLE), seed=0)
+    return found(calibrated(_fault(state).made(straight)), state)
+
+
+def asked_slip(ground: str) -> tuple[float, float]:
+    """`surge_slip` of a drive with exact sensors."""
+    return surge_slip(simulate(pulsing(ground), vehicle=load_vehicle(VEHICLE), noiseless=True))
+
+
+def turning(narrow: bool, seed: int) -> tuple[float, float, float]:
+    """Yaw scale found, its sigma, and that of the twin; with the true track or one told too narrow."""
+    log, track_m = drive(GROUND, seed), load_vehicle(VEHICLE).rig().track_m
+    value, sigma = found(replay(narrow_track(log) if narrow else log), "yaw_scale")
+    return value, sigma, effective_yaw_scale(log, track_m * (1.0 - TRACK_SHARE) if narrow else track_m)
+
+
+def unbroken(calibrate: bool, seed: int) -> tuple[float | None, float | None]:
+    """Errors of position, m, and heading, rad, where the vehicle file is right."""
+    settings = {"calibrate": True} if calibrate else {}
+    scores = replay(drive(GROUND, seed), settings=settings).scores
+    return scores.ate_m, scores.yaw_rmse_rad
+
+
+Trial = tuple[str, tuple[Any, ...]]
+TRIALS: dict[str, Callable[..., tuple[Any, ...]]] = {
+    one.__name__: one for one in (sought, unexcited, asked_slip, turning, unbroken)
+}
+
+
+def trial(what: Trial) -> tuple[Any, ...]:
+    """One trial by its name and what it is given."""
+    name, given = what
+    return TRIALS[name](*given)
+
+
+def trials(seeds: int) -> list[Trial]:
+    """All of them."""
+    states = [fault.state for fault in faults()]
+    places = [(GROUND, s) for s in states] + [(g, s) for g in GROUNDS[1:] for s in states if s in ELSEWHERE]
+    return [
+        *(("sought", (*place, seed)) for seed in range(seeds) for place in places),
+        *(("unexcited", (state,)) for state in states),
+        *(("asked_slip", (ground,)) for ground in GROUNDS),
+        *(
+            (name, (yes, seed))
+            for name in ("turning", "unbroken")
+            for yes in (False, True)
+            for seed in range(seeds)
+        ),
+    ]
+
+
+def report(seeds: int, told: Mapping[Trial, Sequence[float]]) -> Iterator[str]:
+    """The tables, line by line, from the answers of all trials."""
+    yield f"{seeds} seeds: expected; found; sigma; r.m.s. and largest error over sigma; sigma if dull"
     for fault in faults():
-        left, sigma = found(calibrated(fault.made(straight)), fault.state)
+        left, sigma = told["unexcited", (fault.state,)]
         shrunk = f"{sigma / CALIBRATION_SIGMA[fault.state]:.2f} of the prior's (value {left:.4f})"
-        yield f"{_sought(fault, drives[GROUND])}; {shrunk}"
+        yield f"{_sought(fault, GROUND, seeds, told)}; {shrunk}"
     yield "other grounds, likewise"
     for ground in GROUNDS[1:]:
         for fault in faults():
-            if fault.state in ("antenna_x_m", "wheel_delay_s", "gnss_delay_s"):
-                yield f"  {ground}{_sought(fault, drives[ground])}"
+            if fault.state in ELSEWHERE:
+                yield f"  {ground}{_sought(fault, ground, seeds, told)}"
     yield "slip that an acceleration of one gravity asks for; v0, m/s (straight on, exact sensors)"
     for ground in GROUNDS:
-        exact = simulate(pulsing(ground), vehicle=load_vehicle(VEHICLE), noiseless=True)
-        yield "  {}: {:.3f}; {:.2f}".format(ground, *surge_slip(exact))
-    yield from _yaw_scales(drives[GROUND])
+        yield "  {}: {:.3f}; {:.2f}".format(ground, *told["asked_slip", (ground,)])
+    yield "yaw scale: of the twin; found; sigma (as built, then a track told 10 % too narrow)"
+    for narrow in (False, True):
+        rows = [told["turning", (narrow, seed)] for seed in range(seeds)]
+        value, sigma = np.mean([row[:2] for row in rows], axis=0)
+        yield f"  {np.mean([row[2] for row in rows]):.3f}; {value:.3f}; {sigma:.3f}"
     yield "vehicle file right: position error m, heading error rad (medians), without and with calibration"
-    for settings in ({}, {"calibrate": True}):
-        scores = [replay(drive, settings=settings).scores for drive in drives[GROUND]]
-        ate, yaw = (np.median([getattr(s, name) for s in scores]) for name in ("ate_m", "yaw_rmse_rad"))
+    for calibrate in (False, True):
+        ate, yaw = np.median([told["unbroken", (calibrate, seed)] for seed in range(seeds)], axis=0)
         yield f"  {ate:.4f}, {yaw:.4f}"
 
 
-def _driven(scenario: Scenario, seeds: int) -> list[Recording]:
-    return [simulate(scenario, vehicle=load_vehicle(VEHICLE), seed=seed) for seed in range(seeds)]
+def _fault(state: str) -> Fault:
+    return next(fault for fault in faults() if fault.state == state)
 
 
-def _sought(fault: Fault, drives: list[Recording]) -> str:
-    pairs = np.array([found(calibrated(fault.made(drive)), fault.state) for drive in drives])
+def _sought(fault: Fault, ground: str, seeds: int, told: Mapping[Trial, Sequence[float]]) -> str:
+    pairs = np.array([told["sought", (ground, fault.state, seed)] for seed in range(seeds)])
     z = (pairs[:, 0] - fault.expected) / pairs[:, 1]
     return (
         f"  {fault.state}: {fault.expected:.4f}; {pairs[:, 0].mean():.4f}; {pairs[:, 1].mean():.4f}; "
         f"{np.sqrt(np.mean(z**2)):.1f}; {np.abs(z).max():.1f}"
     )
-
-
-def _yaw_scales(drives: list[Recording]) -> Iterator[str]:
-    yield "yaw scale: of the twin; found; sigma (as built, then a track told 10 % too narrow)"
-    track_m = load_vehicle(VEHICLE).rig().track_m
-    for made, told_m in ((lambda r: r, track_m), (narrow_track, (1.0 - TRACK_SHARE) * track_m)):
-        results = [replay(made(drive)) for drive in drives]
-        value, sigma = np.mean([found(result, "yaw_scale") for result in results], axis=0)
-        twin = np.mean([effective_yaw_scale(drive, told_m) for drive in drives])
-        yield f"  {twin:.3f}; {value:.3f}; {sigma:.3f}"
 
 
 def _told(recording: Recording, **overrides: object) -> Recording:
@@ -230,9 +290,16 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5)
-    for line in report(parser.parse_args().seeds):
-        print(line, flush=True)
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
+    given = parser.parse_args()
+    wanted = trials(given.seeds)
+    told = dict(zip(wanted, answers(wanted, trial, TaskWorkers.of(given), given.out), strict=True))
+    for line in report(given.seeds, told):
+        print(line)
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import calibration_trials
+
+    calibration_trials.main()  # workers know the trials by the module's own name

@@ -28,7 +28,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from tests.studies.parts import add_options, answers
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 SOILS = ("asphalt", "loose_sand", "medium_sand", "mud")
 DRIVES = ("figure_eight", "chirp", "staircase", "circle")
@@ -133,7 +133,7 @@ def table(found: Sequence[Outcome]) -> list[str]:
     lines.append(
         _row("all, only in combination", [o for o in found if o.status not in (IDENTIFIED, NOT_IDENTIFIED)])
     )
-    lines.append(_row("all, not told", [o for o in found if o.status == NOT_IDENTIFIED]))
+    lines.append(_row("all, not identified", [o for o in found if o.status == NOT_IDENTIFIED]))
     return lines
 
 
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     begun = time.perf_counter()
     cases = [(number, given.seed) for number in range(given.first, given.first + given.cases)]
-    told = answers(cases, answer, given, given.out)
+    told = answers(cases, answer, TaskWorkers.of(given), given.out)
     found = [Outcome(**row) for one in told if isinstance(one, list) for row in one]
     failed = sum(isinstance(one, str) for one in told)
     for one in told:

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
-from tests.studies.parts import add_options, answers
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 DRIVES = {
     "demo": ((75.0, 60.0), {}),
@@ -63,7 +63,7 @@ def main() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
     for scenario in given.drive or DRIVES:
         trials = [(scenario, mode, seed) for mode in MODES for seed in seeds]
-        errors = answers(trials, errors_m, given, given.out)
+        errors = answers(trials, errors_m, TaskWorkers.of(given), given.out)
         found = {mode: errors[i * given.seeds :][: given.seeds] for i, mode in enumerate(MODES)}
         for mode in MODES:
             whole, inside, end = (median(column) for column in zip(*found[mode], strict=True))

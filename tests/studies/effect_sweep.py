@@ -11,22 +11,25 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import lookup
-from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 SEGMENTS = (
     (0.5, 0.0, 0.0), (5.0, 0.8, 0.4), (5.0, 1.2, -0.5), (4.0, 0.5, 0.0), (4.0, 0.0, 0.8), (5.0, 1.4, 0.0),
@@ -62,14 +65,27 @@ class Bench:
         run = simulate(drive, vehicle=self.vehicle, seed=1000 * self.seed + number, effects=own)
         return dataclasses.replace(run, name=f"run{number}", truth=None, truth_channels=())
 
-    def diagnoses(self, changes: Sequence[Mapping[str, float]]) -> Iterator[GapDiagnosis]:
-        """One for each change, against the same references."""
-        normal = [self.recorded(i, {}) for i in range(self.references)]
-        cache = dict[str, Linearisation]()
-        for i, change in enumerate(changes):
-            first = self.references + i * self.runs
-            judged = [self.recorded(first + k, change) for k in range(self.runs)]
-            yield diagnose(judged, normal, self.vehicle, cache=cache)
+    def normal(self) -> list[Recording]:
+        """The references of all changes."""
+        return [self.recorded(i, {}) for i in range(self.references)]
+
+
+@functools.lru_cache(maxsize=1)
+def bench_of(
+    vehicle: str, soil: str, runs: int, references: int, seed: int
+) -> tuple[Bench, list[Recording], dict[str, Linearisation]]:
+    """A bench, its references, and what has been computed of them in this process."""
+    bench = Bench(load_vehicle(vehicle), soil, runs, references, seed)
+    return bench, bench.normal(), {}
+
+
+def answer(case: tuple[tuple[str, str, int, int, int], int, str, float]) -> dict[str, Any]:
+    """The diagnosis of one change: bench, number of the case, parameter and size."""
+    of, number, key, size = case
+    bench, normal, cache = bench_of(*of)
+    first = bench.references + number * bench.runs
+    judged = [bench.recorded(first + k, {key: size}) for k in range(bench.runs)]
+    return diagnose(judged, normal, bench.vehicle, cache=cache).to_json()
 
 
 def first_forms(effects: Sequence[str] | None = None) -> dict[str, str]:
@@ -84,17 +100,17 @@ def first_forms(effects: Sequence[str] | None = None) -> dict[str, str]:
     return found
 
 
-def row(found: GapDiagnosis, key: str, size: float) -> str:
+def row(told: Mapping[str, Any], key: str, size: float) -> str:
     """A line of the table."""
-    told = found.to_json()
+    detected = told["gap"]["detected"]
     first, unit = told["causes"][0], lookup(key)[1].unit
     number = next((c["parameters"][key] for c in told["causes"] if key in c["parameters"]), None)
     others = [name for name in first["class"] if name != first["effect"]]
     cells = (
         f"`{key}`", f"{size:.3g} {unit}".rstrip(), f"{told['gap']['p_value']:.2f}", told["verdict"],
-        f"{', '.join([first['effect'], *others])} ({first['probability']:.2f})" if found.detected else "",
+        f"{', '.join([first['effect'], *others])} ({first['probability']:.2f})" if detected else "",
         ", ".join(told["named"]),
-        f"{number['value']:.3g} +- {number['sigma'] or 0.0:.1g}" if number and found.detected else "",
+        f"{number['value']:.3g} +- {number['sigma'] or 0.0:.1g}" if number and detected else "",
     )  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
@@ -111,24 +127,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--references", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args(arguments)
     if given.runs < 1 or min(given.references, given.seed) < 0:
         parser.error("--runs is at least 1, --references and --seed at least 0")
     try:
-        bench = Bench(load_vehicle(given.vehicle), given.terrain, given.runs, given.references, given.seed)
+        bench = (given.vehicle, given.terrain, given.runs, given.references, given.seed)
         cases = []
         for key in first_forms(given.effects).values():
             number = lookup(key)[1]
             cases += [(key, min(share * number.scale, number.high)) for share in given.sizes]
-        head = "| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD) + "\n"
-        for (key, size), found in zip(cases, bench.diagnoses([dict([case]) for case in cases]), strict=True):
-            print(head + row(found, key, size), flush=True)
-            head = ""
+        trials = [(bench, number, *case) for number, case in enumerate(cases)]
+        found = answers(trials, answer, TaskWorkers.of(given), given.out)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
+    for told, (key, size) in zip(found, cases, strict=True):
+        print(row(told, key, size))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from tests.studies import effect_sweep
+
+    sys.exit(effect_sweep.main())  # workers know the cases by the module's own name

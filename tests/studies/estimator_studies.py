@@ -39,25 +39,28 @@ ESTIMATOR = (
     Study(
         "slip",
         "How far off is the estimated slip, and how late is immobilisation seen?",
-        module("slip_trials"),
+        module("slip_trials", "--out", OUT),
         30,
         {
             f"{ground}_{what}": rf" *{ground} \d+ deg:" + (r" [\d.]+," if i else "") + r" ([\d.]+)"
             for ground in ("mud", "loose_sand", "medium_sand", "asphalt")
             for i, what in enumerate(("filtered", "smoothed"))
         },
+        spread=True,
     ),
     Study(
         "calibration_states",
         "Does the estimator find wrong numbers of the vehicle file while it drives?",
-        module("calibration_trials"),
+        module("calibration_trials", "--out", OUT),
         20,
+        spread=True,
     ),
     Study(
         "twin_consistency",
         "Are NEES and NIS in their bands on every ground of the twin?",
-        module("twin_consistency"),
+        module("twin_consistency", "--out", OUT),
         15,
+        spread=True,
     ),
     Study(
         "field_table",
@@ -211,7 +214,6 @@ ESTIMATOR = (
             f"{family}_{plant}_over_fixed": rf"\| {family}, {plant} (?:\|[^|]*){{5}}\| ([^|]+?) \|"
             for family, plant in (("mixed", "twin"), ("mixed", "second"), ("unseen", "second"))
         },
-        picture="ratios.png",
         spread=True,
     ),
     Study(

@@ -34,7 +34,7 @@ from terrafusion.fusion.replay import replay
 from terrafusion.fusion.training.simulated_runs import wheel_samples
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.simulate import simulate
-from tests.studies.parts import add_options, answers
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 DEMO_OUTAGE = Outage(75.0, 60.0)
 DEVELOP = {"demo": range(1000, 1020), "mixed": range(100_000, 100_010)}
@@ -256,7 +256,7 @@ def main() -> int:
             continue
         found: dict[str, list[Array]] = {}
         drives = [(family, seed, given.arms) for seed in list(seeds)[: given.drives]]
-        for answer in answers(drives, causes, given, given.out):
+        for answer in answers(drives, causes, TaskWorkers.of(given), given.out):
             for arm, rows in answer.items():
                 found.setdefault(arm, []).append(np.array(rows))
         report(family, found)

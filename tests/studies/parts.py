@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.executors import BACKENDS, open_workers
 
 ROOT = Path(__file__).parents[2]
@@ -137,13 +138,22 @@ def run_all(
 
 
 def answers(
-    items: Sequence[Any], compute: Compute, given: argparse.Namespace, out: Path | None
+    items: Sequence[Any], compute: Compute, workers: TaskWorkers, out: Path | None
 ) -> list[Any]:  # fmt: skip
-    """`compute` of each item, as JSON gives it; kept in `out`, if there is one, for this commit."""
+    """`compute` of each item, as JSON gives it; kept in `out`, if there is one, for this commit.
+
+    Raises:
+        TerrafusionError: the time is over before all are done, or as `run_all`.
+    """
+    code = library_code()
     with tempfile.TemporaryDirectory() as empty:
         folder = Path(empty) if out is None else out / "parts"
-        tasks = [Task(f"{compute.__module__} {item!r}", library_code(), item) for item in items]
-        run_all(tasks, compute, folder, TaskWorkers.of(given))
+        tasks = [Task(f"{compute.__module__} {item!r}", code, item) for item in items]
+        run_all(tasks, compute, folder, workers)
+        missing = sum(not task.file(folder).is_file() for task in tasks)
+        if missing:
+            remedy = "give more --minutes" if out is None else "the same command continues"
+            raise TerrafusionError(f"{missing} of {len(tasks)} trials are missing", remedy=remedy)
         return [result_of(task, folder) for task in tasks]
 
 

@@ -53,13 +53,14 @@ PRODUCT = (
     Study(
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
-        module("fault_matrix.matrix", "--cells", "1000", "--seconds", "7200", "--out", OUT),
+        module("fault_matrix.matrix", "--cells", "1000", "--minutes", "120", "--out", OUT),
         35,
         {
             "cells": r"cells (\d+)",
             **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
             "good_refused": r"ok and yet not good (\d+ of \d+)",
         },
+        spread=True,
     ),
     Study(
         "kills",

@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import copy
 import dataclasses
+import functools
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -225,61 +228,77 @@ def slip_rmse(ground: str, slope_deg: float, seed: int, batch: bool) -> float:
     return 100.0 * float(np.sqrt(np.nanmean((estimate.slip - slip) ** 2)))
 
 
-def report(
-    seeds: int,
-    tables: Collection[str] = TABLES,
-    encoders: Collection[str] = ENCODERS,
-    aiding: Collection[bool] = (True, False),
-) -> Iterator[str]:
-    """The tables, line by line; `aiding` says whether there are fixes."""
+def coarse_or_fine(trial: tuple[str, str, bool, int]) -> list[float | None]:
+    """The numbers of one trial: its name in `TRIALS`, encoders, whether there are fixes, and the seed."""
+    name, encoders, gnss, seed = trial
     with tempfile.TemporaryDirectory() as folder:
-        files = {"fine": "elevate", "coarse": str(coarse_vehicle(Path(folder)))}
-        given = [(name, files[name], gnss) for name in encoders for gnss in aiding]
-        if "alarms" in tables:
-            yield "false alarms, straight on firm ground"
-            for name, vehicle, gnss in given:
-                yield f"  {name}, {_aid(gnss)}: {_alarm_text(vehicle, gnss, seeds)}"
-        if "delays" in tables:
-            yield "told late"
-            for name, vehicle, gnss in given:
-                for what, trials in _delay_trials(vehicle, gnss, seeds).items():
-                    yield f"  {name}, {_aid(gnss)}: {what}: {delays_text(list(trials))}"
+        vehicle = "elevate" if encoders == "fine" else str(coarse_vehicle(Path(folder)))
+        return list(dataclasses.astuple(TRIALS[name](vehicle, seed, gnss)))
+
+
+def slip_error(trial: tuple[str, float, int, bool]) -> float:
+    """`slip_rmse` of one trial."""
+    return slip_rmse(*trial)
+
+
+def _stalled(vehicle: str, seed: int, gnss: bool) -> Told:
+    return stuck_trial("paper_profile", "mud", vehicle, seed, gnss)
+
+
+def _spinning(vehicle: str, seed: int, gnss: bool) -> Told:
+    return stuck_trial(spinning_hill(), None, vehicle, seed, gnss)
+
+
+TRIALS: dict[str, Callable[[str, int, bool], Count | Told]] = {
+    "alarms": count_alarms,
+    "slip, loose sand 5 deg": slip_trial,
+    "stalled in mud": _stalled,
+    "spinning, loose sand 20 deg": _spinning,
+}
+SLIP_GROUNDS = (("mud", 0.0), ("loose_sand", 5.0), ("medium_sand", 5.0), ("asphalt", 0.0))
+Answers = Callable[[Sequence[Any], Callable[[Any], Any]], list[Any]]
+
+
+def report(
+    seeds: int, tables: Collection[str], encoders: Collection[str], aiding: Collection[bool], answers: Answers
+) -> Iterator[str]:  # fmt: skip
+    """The tables, line by line; `aiding` says whether there are fixes."""
+    given = [(name, gnss) for name in encoders for gnss in aiding]
+
+    def found(what: str, name: str, gnss: bool) -> list[list[Any]]:
+        return answers([(what, name, gnss, seed) for seed in range(seeds)], coarse_or_fine)
+
+    if "alarms" in tables:
+        yield "false alarms, straight on firm ground"
+        for name, gnss in given:
+            counts = sum((Count(*row) for row in found("alarms", name, gnss)), Count())
+            yield f"  {name}, {_aid(gnss)}: {_alarm_text(counts)}"
+    if "delays" in tables:
+        yield "told late"
+        for name, gnss in given:
+            for what in list(TRIALS)[1:]:
+                told = [Told(*row) for row in found(what, name, gnss)]
+                yield f"  {name}, {_aid(gnss)}: {what}: {delays_text(told)}"
     if "slip" in tables:
-        yield from _slip_lines(min(seeds, 3))
+        yield "slip RMSE, points, paper_profile: filtered, smoothed"
+        few = range(min(seeds, 3))
+        for ground, slope in SLIP_GROUNDS:
+            errors = answers([(ground, slope, s, batch) for batch in (False, True) for s in few], slip_error)
+            filtered, smoothed = np.mean(errors[: len(few)]), np.mean(errors[len(few) :])
+            yield f"  {ground} {slope:.0f} deg: {filtered:.2f}, {smoothed:.2f}"
 
 
 def _aid(gnss: bool) -> str:
     return "GNSS" if gnss else "no GNSS"
 
 
-def _alarm_text(vehicle: str, gnss: bool, seeds: int) -> str:
-    c = sum((count_alarms(vehicle, seed, gnss) for seed in range(seeds)), Count())
+def _alarm_text(c: Count) -> str:
     slip, stuck = poisson_interval(c.slipping, c.seconds), poisson_interval(c.immobilised, c.seconds)
     return (
         f"{c.seconds / 60.0:.1f} min; slip {c.slipping} ({slip[0]:.1f} to {slip[1]:.1f} /h); "
         f"immobilised {c.immobilised} ({stuck[0]:.1f} to {stuck[1]:.1f} /h); "
         f"naive {c.naive} ({c.naive / c.seconds:.3f} /s)"
     )
-
-
-def _delay_trials(vehicle: str, gnss: bool, seeds: int) -> dict[str, Iterator[Told]]:
-    """What is told late, and its trials: one a seed, made as they are asked for."""
-
-    def stuck(scenario: str | Scenario, terrain: str | None) -> Iterator[Told]:
-        return (stuck_trial(scenario, terrain, vehicle, seed, gnss) for seed in range(seeds))
-
-    return {
-        "slip, loose sand 5 deg": (slip_trial(vehicle, seed, gnss) for seed in range(seeds)),
-        "stalled in mud": stuck("paper_profile", "mud"),
-        "spinning, loose sand 20 deg": stuck(spinning_hill(), None),
-    }
-
-
-def _slip_lines(seeds: int) -> Iterator[str]:
-    yield "slip RMSE, points, paper_profile: filtered, smoothed"
-    for ground, slope in (("mud", 0.0), ("loose_sand", 5.0), ("medium_sand", 5.0), ("asphalt", 0.0)):
-        found = [[slip_rmse(ground, slope, seed, batch) for seed in range(seeds)] for batch in (False, True)]
-        yield f"  {ground} {slope:.0f} deg: {np.mean(found[0]):.2f}, {np.mean(found[1]):.2f}"
 
 
 def main() -> None:
@@ -289,11 +308,16 @@ def main() -> None:
     parser.add_argument("--tables", nargs="+", choices=TABLES, default=TABLES, help="which of them")
     parser.add_argument("--encoders", nargs="+", choices=ENCODERS, default=ENCODERS, help="which of them")
     parser.add_argument("--gnss-only", action="store_true", help="leave out the drives without GNSS")
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args()
     aiding = (True,) if given.gnss_only else (True, False)
-    for line in report(given.seeds, given.tables, given.encoders, aiding):
+    kept = functools.partial(answers, workers=TaskWorkers.of(given), out=given.out)
+    for line in report(given.seeds, given.tables, given.encoders, aiding, kept):
         print(line, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import slip_trials
+
+    slip_trials.main()  # workers know the trials by the module's own name

@@ -13,9 +13,12 @@ effective samples of all drives added up. The interval is the bootstrap's over d
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -28,6 +31,7 @@ from terrafusion.fusion.metrics.consistency import (
     whitened_series,
 )
 from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, VERDICT_SIGNS, PooledConsistency, pool
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 MODES = ("adaptive", "fixed")
 SCENARIO = "waypoints"
@@ -42,6 +46,10 @@ TABLES = (
 )
 
 
+Drive = tuple[str, str, float, int, tuple[str, ...]]
+"""Scenario, ground, slope in degrees, seed, and the modes in which it is replayed."""
+
+
 @dataclass(frozen=True)
 class ConsistencyPlan:
     """Which drives are made: `seeds` of each ground, in each mode."""
@@ -52,9 +60,10 @@ class ConsistencyPlan:
     scenario: str = SCENARIO
     slope_deg: float = 0.0
 
-    def runs(self) -> int:
-        """Number of replays."""
-        return self.seeds * len(self.terrains) * len(self.modes)
+    def drives(self) -> list[Drive]:
+        """All drives, ground by ground."""
+        seeds = range(FIRST_SEED, FIRST_SEED + self.seeds)
+        return [(self.scenario, t, self.slope_deg, seed, self.modes) for t in self.terrains for seed in seeds]
 
 
 @dataclass(frozen=True)
@@ -65,34 +74,47 @@ class ConsistencyResult:
     refused: tuple[str, ...] = ()
 
 
-def run(plan: ConsistencyPlan, progress: Callable[[float], None] | None = None) -> ConsistencyResult:
+def run(
+    plan: ConsistencyPlan, workers: TaskWorkers | None = None, out: Path | None = None
+) -> ConsistencyResult:
     """Drive, replay and test; the same plan finds the same.
 
     Raises:
         ConfigError: no seeds, or an unknown ground or scenario.
     """
-    from terrafusion.fusion.training.simulated_runs import Condition
-
     if plan.seeds < 1:
         raise ConfigError(f"{plan.seeds} seeds are none", remedy="give --seeds 1 or more")
-    cells: list[PooledConsistency] = []
+    found: dict[tuple[str, str], list[tuple[Consistency, ...]]] = {
+        (terrain, mode): [] for terrain in plan.terrains for mode in plan.modes
+    }
     refused: list[str] = []
-    done = 0
-    for terrain in plan.terrains:
-        drives: dict[str, list[tuple[Consistency, ...]]] = {mode: [] for mode in plan.modes}
-        for seed in range(FIRST_SEED, FIRST_SEED + plan.seeds):
-            recording = Condition(plan.scenario, terrain, plan.slope_deg, 0.0, seed).run()
-            for mode in plan.modes:
-                try:
-                    drives[mode].append(checked_drive(recording, mode))
-                except DataError as error:
-                    refused.append(f"{terrain}, {mode}, seed {seed}: {error}")
-                done += 1
-                if progress is not None:
-                    progress(done / plan.runs())
-        for mode in plan.modes:
-            cells += pool(terrain, mode, drives[mode])
+    drives = plan.drives()
+    for drive, told in zip(
+        drives, answers(drives, checked_modes, workers or TaskWorkers(), out), strict=True
+    ):
+        _, terrain, _, seed, _ = drive
+        for mode, rows in zip(plan.modes, told, strict=True):
+            if isinstance(rows, str):
+                refused.append(f"{terrain}, {mode}, seed {seed}: {rows}")
+            else:
+                found[terrain, mode].append(tuple(Consistency(**row) for row in rows))
+    cells = [cell for (terrain, mode), rows in found.items() for cell in pool(terrain, mode, rows)]
     return ConsistencyResult(tuple(cells), tuple(refused))
+
+
+def checked_modes(drive: Drive) -> list[list[dict[str, object]] | str]:
+    """The quantities of a drive in each mode, or why it could not be estimated."""
+    from terrafusion.fusion.training.simulated_runs import Condition
+
+    scenario, terrain, slope_deg, seed, modes = drive
+    recording = Condition(scenario, terrain, slope_deg, 0.0, seed).run()
+    found: list[list[dict[str, object]] | str] = []
+    for mode in modes:
+        try:
+            found.append([dataclasses.asdict(row) for row in checked_drive(recording, mode)])
+        except DataError as error:
+            found.append(str(error))
+    return found
 
 
 def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
@@ -133,11 +155,6 @@ def _text(cell: PooledConsistency) -> str:
 
 def command(arguments: list[str] | None = None) -> int:
     """`python -m tests.studies.twin_consistency`: 0 when done, 1 with one line for a known error."""
-    import argparse
-    import sys
-
-    from terrafusion.fusion.cli.common import progress_bar
-
     parser = argparse.ArgumentParser(
         prog="python -m tests.studies.twin_consistency",
         description="NEES and NIS of the estimator on twin drives of each ground.",
@@ -149,13 +166,14 @@ def command(arguments: list[str] | None = None) -> int:
     parser.add_argument("--mode", nargs="+", default=plan.modes, help="modes of the estimator")
     parser.add_argument("--scenario", default=plan.scenario, help=f"default {plan.scenario}")
     parser.add_argument("--slope-deg", type=float, default=plan.slope_deg, help="default 0")
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
     given = parser.parse_args(arguments)
     asked = ConsistencyPlan(
         given.seeds, tuple(given.terrain), tuple(given.mode), given.scenario, given.slope_deg
     )
     try:
-        with progress_bar("consistency") as progress:
-            found = run(asked, progress)
+        found = run(asked, TaskWorkers.of(given), given.out)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -178,4 +196,6 @@ def report(plan: ConsistencyPlan, found: ConsistencyResult) -> list[str]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(command())
+    from tests.studies import twin_consistency
+
+    raise SystemExit(twin_consistency.command())  # workers know the drives by the module's own name

@@ -93,14 +93,16 @@ TWIN = (
     Study(
         "effect_sweep",
         "Which effects does the diagnosis see in the twin's own runs, and at what size?",
-        module("effect_sweep"),
+        module("effect_sweep", "--out", OUT),
         20,
+        spread=True,
     ),
     Study(
         "fault_injection",
         "Does the diagnosis name known changes that are put into real logs?",
         module("fault_injection.table", "--out", OUT),
         60,
+        spread=True,
     ),
     Study(
         "effective_track",
@@ -130,7 +132,6 @@ TWIN = (
             "plant": r".* trials of plant (\w+)",
             **{key: rf"{name} {{2,}}((?:\S+ )*?\S+)(?: {{2,}}|$)" for key, name in BLIND_FIGURES.items()},
         },
-        "sheet.png",
         spread=True,
     ),
     Study(

@@ -5,13 +5,13 @@
 A log is cut into pieces. In turn, every fourth piece is judged and the others are its references; the change
 is put into the judged ones only. Unchanged pieces are judged likewise: a gap found there is a false alarm,
 or a change within the drive. Pieces in which the robot rests are left out. A crash is a wrong answer.
-Answers are kept one by one in `injections.jsonl`; the same command continues where it was stopped.
+Answers are kept one by one; the same command continues where it was stopped.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import functools
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -31,6 +31,7 @@ from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.model.version import model_sha256
 from tests.studies.fault_injection.faults import INJECTIONS, Injection, pose_as_gnss
+from tests.studies.parts import Task, TaskWorkers, add_options, result_of, run_all
 
 SEVERITIES = (0.5, 1.0, 2.0, 4.0)
 SUSPECTS = (
@@ -210,62 +211,56 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--suspects", action="store_true", help="only sensors, wheels and ground, see SUSPECTS"
     )
-    parser.add_argument("--sum", action="store_true", help="print the sums of the answers that are there")
+    parser.add_argument("--sum", action="store_true", help="run nothing: sums of the answers that are there")
+    add_options(parser)
     given = parser.parse_args(arguments)
+    workers = None if given.sum else TaskWorkers.of(given)
     try:
-        if given.sum:
-            print("\n".join(sums(list(rows_of(given.out / "injections.jsonl")))))
-        else:
-            run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else None)
+        run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else (), workers)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def run(out: Path, sets: Sequence[str], effects: Sequence[str] | None) -> None:
-    """The table of some sets, written to `out` row by row; rows of other sources or effects are made anew.
+def run(out: Path, sets: Sequence[str], effects: Sequence[str], workers: TaskWorkers | None) -> None:
+    """The table of some sets, written to `out`; rows of other sources or effects are made anew.
+
+    Args:
+        effects: to choose from; none for the whole catalogue.
+        workers: None to run nothing.
 
     Raises:
         TerrafusionError: a log is not at hand or cannot be read, or the folder cannot be written.
     """
     check_folder(out)
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / "injections.jsonl"
-    made_by = {"model_sha256": model_sha256(), "effects": list(effects or ())}
-    kept = {row["case"]: row for row in rows_of(path) if row.get("made_by") == made_by}
-    sources = dict[str, Source]()
-    with path.open("a", encoding="utf-8") as file:
-        if file.tell() and not path.read_text("utf-8").endswith("\n"):  # stopped in the midst of a row
-            file.write("\n")
-        for name, injection, severity, fold in cases(sets):
-            what = "unchanged" if injection is None else injection.name
-            case = f"{name}/{what}/{severity:g}/{fold}"
-            if case in kept:
-                continue
-            if name not in sources:
-                sources[name] = Source.of(SETS[name])
-            answer = answered(sources[name], SETS[name], injection, severity, fold, effects)
-            size = 0.0 if injection is None else severity * injection.size
-            row = {"case": case, "set": name, "change": what, "severity": severity, "size": size, **answer}
-            row["made_by"] = made_by
-            kept[case] = row
-            print(json.dumps(row), file=file, flush=True)
-            print(table([row])[-1], flush=True)
-    rows = list(kept.values())
+    code = f"{model_sha256()} {' '.join(effects)}"
+    tasks = []
+    for name, injection, severity, fold in cases(sets):
+        change = None if injection is None else INJECTIONS.index(injection)
+        what = (name, change, severity, fold, tuple(effects) or None)
+        tasks.append(Task("/".join(map(str, what[:4])), code, what))
+    if workers is not None:
+        run_all(tasks, row_of, out / "parts", workers)
+    rows = [row for task in tasks if (row := result_of(task, out / "parts")) is not None]
     text = "\n".join([*sums(rows), "", *table(rows)])
     (out / "injections.md").write_text(text + "\n", encoding="utf-8")
+    print(text)
 
 
-def rows_of(path: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a file that may not be there, or end in half a line."""
-    for line in path.read_text("utf-8").splitlines() if path.exists() else []:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(row, dict) and "case" in row:
-            yield row
+@functools.lru_cache(maxsize=1)
+def source_of(name: str) -> Source:
+    """The logs of a set, read once in a process."""
+    return Source.of(SETS[name])
+
+
+def row_of(case: tuple[str, int | None, float, int, tuple[str, ...] | None]) -> dict[str, Any]:
+    """One row: set, number of the change, severity, fold, and the effects to choose from."""
+    name, change, severity, fold, effects = case
+    injection = None if change is None else INJECTIONS[change]
+    found = answered(source_of(name), SETS[name], injection, severity, fold, effects)
+    what, size = ("unchanged", 0.0) if injection is None else (injection.name, severity * injection.size)
+    return {"set": name, "change": what, "severity": severity, "size": size, **found}
 
 
 HEAD = ("set", "change", "size", "p", "verdict", "first (class)", "rank", "estimated", "right")

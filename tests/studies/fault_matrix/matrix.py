@@ -1,27 +1,29 @@
 """A matrix of faults: does the estimator, or its verdict, fail silently?
 
-    python -m tests.studies.fault_matrix.matrix --cells 1000 --seconds 1200 --out OUT
+    python -m tests.studies.fault_matrix.matrix --cells 1000 --minutes 20 --out OUT
 
 A cell is one or two faults, a log, a mode and live or batch, drawn at random with a seed: cell i is the same
-in every run, and a run goes on where one was stopped. The truth is kept from the verdict; where a log has
-none, the estimate of the clean log stands for it. *Silent*: an error of more than 10 m or, for more than 1 %
-of the time, of five sigmas, while the verdict is good. Rules of the verdict were set on cells below 640
-(`DEVELOPED`); those from there on only judge them.
+in every run, and a run of the same code goes on where one was stopped. The truth is kept from the verdict;
+where a log has none, the estimate of the clean log stands for it. *Silent*: an error of more than 10 m or,
+for more than 1 % of the time, of five sigmas, while the verdict is good. Rules of the verdict were set on
+cells below 640 (`DEVELOPED`); those from there on only judge them.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
 import dataclasses
 import functools
-import json
 import os
-import signal
+import sys
+import threading
 import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_ove
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from tests.studies.fault_matrix.faults import FAULTS
+from tests.studies.parts import Task, TaskWorkers, add_options, code_of, library_code, result_of, run_all
 
 TWIN = ("skid", "steered")
 FIELD = {"husky": ("husky_parkinglot/test1", 130.0, 60.0), "pathfinder": ("wvu_pathfinder/s5t1", 80.0, 40.0)}
@@ -143,14 +146,13 @@ def tried(cell: Cell) -> dict[str, Any]:
     """The outcome of a cell: refused, or a verdict and errors, or a defect."""
     row: dict[str, Any] = dataclasses.asdict(cell)
     begun = time.process_time()
-    signal.signal(signal.SIGALRM, _hangs)
-    signal.alarm(HANG_S)
     try:
-        log = dataclasses.replace(cell.faulty(clean_log(cell.log)), truth=None, truth_channels=())
-        outages = (Outage(25.0, 8.0),) if cell.number % 8 == 0 else ()
-        result = replay(log, vehicle=vehicle_of(cell.log), mode=cell.mode, batch=cell.batch, outages=outages)
+        with ended_after(HANG_S):
+            log = dataclasses.replace(cell.faulty(clean_log(cell.log)), truth=None, truth_channels=())
+            outages = (Outage(25.0, 8.0),) if cell.number % 8 == 0 else ()
+            vehicle = vehicle_of(cell.log)
+            result = replay(log, vehicle=vehicle, mode=cell.mode, batch=cell.batch, outages=outages)
         seconds = time.process_time() - begun
-        signal.alarm(0)
         row |= judged(result, cell) | {"seconds": round(seconds, 2)}
         if row["outcome"] == "ok" and seconds > SLOWER * LEAST_CLEAN_S:
             clean_s = clean_run(cell.log, cell.mode, cell.batch)[1]
@@ -161,9 +163,21 @@ def tried(cell: Cell) -> dict[str, Any]:
         row["outcome"] = "hang"
     except Exception:
         row |= {"outcome": "crash", "why": traceback.format_exc()[-600:]}
-    finally:
-        signal.alarm(0)
     return row
+
+
+@contextlib.contextmanager
+def ended_after(seconds: float) -> Iterator[None]:
+    """TimeoutError in this thread after so long; workers of a cluster compute outside the main thread."""
+    raised = ctypes.py_object(TimeoutError)
+    thread = ctypes.c_ulong(threading.get_ident())
+    timer = threading.Timer(seconds, ctypes.pythonapi.PyThreadState_SetAsyncExc, (thread, raised))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def judged(result: ReplayResult, cell: Cell) -> dict[str, Any]:
@@ -183,10 +197,6 @@ def judged(result: ReplayResult, cell: Cell) -> dict[str, Any]:
         "beyond": round(beyond, 3),
         "why": [reason[:120] for reason in result.verdict.reasons],
     }
-
-
-def _hangs(*_: Any) -> None:
-    raise TimeoutError
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -227,43 +237,40 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def run(
-    cells: int, seconds: float, out: Path, first: int = 0, faults: Sequence[str] = tuple(FAULTS)
+    cells: int, workers: TaskWorkers, out: Path, first: int = 0, faults: Sequence[str] = tuple(FAULTS)
 ) -> list[dict[str, Any]]:
     """Try cells with one of `faults` in turn until all are done or the time is over.
 
-    What is in `out` is not done again.
+    What is in `out`, of this code, is not done again.
     """
-    data = os.environ.get("TERRAFUSION_DATA", "")
-    logs = (*TWIN, *FIELD) if data else TWIN
-    out.mkdir(parents=True, exist_ok=True)
-    file, rows, until = out / "cells.jsonl", [], time.monotonic() + seconds
-    if file.is_file():
-        rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    done = {row["number"] for row in rows}
-    with file.open("a", encoding="utf-8") as kept:
-        for number in range(first, first + cells):
-            if time.monotonic() > until:
-                break
-            cell = Cell.drawn(number, logs)
-            if number not in done and set(faults) & set(cell.faults):
-                rows.append(tried(cell))
-                kept.write(json.dumps(rows[-1]) + "\n")
-                kept.flush()
-    return sorted(rows, key=lambda row: row["number"])
+    logs = (*TWIN, *FIELD) if os.environ.get("TERRAFUSION_DATA", "") else TWIN
+    code = f"{library_code()} {code_of(*sorted(Path(__file__).parent.glob('*.py')))}"
+    drawn = (Cell.drawn(number, logs) for number in range(first, first + cells))
+    tasks = [Task(f"cell {cell}", code, cell) for cell in drawn if set(faults) & set(cell.faults)]
+    run_all(tasks, tried, out / "parts", workers)
+    return [row for task in tasks if (row := result_of(task, out / "parts")) is not None]
 
 
-def main() -> None:
-    """Run and print the table."""
+def main() -> int:
+    """Run and print the table; 0, or 1 after a known error."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--cells", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--faults", nargs="*", choices=[*FAULTS], default=[*FAULTS])
-    parser.add_argument("--seconds", type=float, default=1200.0, help="stop after so long")
     parser.add_argument("--out", type=Path, required=True)
+    add_options(parser)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    print(table(run(given.cells, given.seconds, given.out, given.first, given.faults)))
+    try:
+        rows = run(given.cells, TaskWorkers.of(given), given.out, given.first, given.faults)
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(table(rows))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies.fault_matrix import matrix
+
+    sys.exit(matrix.main())  # workers know the cells by the module's own name
