@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
     from terrafusion.fusion.metrics.baselines import Baselines
+    from terrafusion.fusion.metrics.scores import Outage
     from terrafusion.fusion.replay import ReplayResult
 
 OUTPUT = Output(
@@ -96,12 +97,11 @@ def replay(
     """
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.grounds.file import read_grounds
-    from terrafusion.fusion.metrics.scores import parse_outage
     from terrafusion.fusion.replay import replay as run
 
     _check_usage(mode, rerun)
     turned = None if declination is None else math.radians(declination)
-    outages = [parse_outage(text) for text in gnss_outage or []]
+    outages = [_outage(text) for text in gnss_outage or []]
     memory = None if grounds is None else read_grounds(grounds)
     recording, findings = _opened(log, vehicle, how, calibrate)
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
@@ -113,6 +113,17 @@ def replay(
         )  # fmt: skip
     unseen = _write(result, out, mcap, rerun, grounds)
     return _shown(result, findings, unseen, out)
+
+
+def _outage(text: str) -> Outage:
+    """An outage; a malformed one is wrong usage (exit status 2)."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.fusion.metrics.scores import parse_outage
+
+    try:
+        return parse_outage(text)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint="--gnss-outage") from None
 
 
 def _check_usage(mode: str, rerun: Path | None) -> None:

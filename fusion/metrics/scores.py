@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Gnss
-from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -115,7 +115,7 @@ def parse_outage(text: str) -> Outage:
     """`START:SECONDS`, both in seconds, as in "120:60".
 
     Raises:
-        TerrafusionError: not two finite numbers, a negative start, or no duration.
+        ConfigError: not two finite numbers, a negative start, or no duration.
     """
     start, colon, seconds = text.partition(":")
     try:
@@ -124,9 +124,8 @@ def parse_outage(text: str) -> Outage:
         outage = Outage(np.nan, np.nan)
     sane = np.isfinite([outage.start_s, outage.seconds]).all()
     if not (colon and sane and outage.start_s >= 0.0 and outage.seconds > 0.0):
-        raise TerrafusionError(
+        raise ConfigError(
             f"'{text}' is not an outage",
-            channel="--gnss-outage",
             remedy="write START:SECONDS with START >= 0 and SECONDS > 0, as in 120:60",
         )
     return outage
