@@ -16,7 +16,7 @@ IDENTIFIED_RATIO = 0.5
 MEMBER = 0.3
 """A parameter belongs to a direction when its weight in the unit vector is at least this."""
 
-IDENTIFIED, COMBINED, NOT_IDENTIFIED = "told", "only in combination", "not told"
+IDENTIFIED, COMBINED, NOT_IDENTIFIED = "identified", "only in combination", "not identified"
 """Values of `status` in calibration.json."""
 
 

@@ -34,7 +34,7 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
     radius = found["parameters"]["vehicle.wheel.radius_m"]
     assert radius["value"] == pytest.approx(0.175, abs=4.0 * radius["sigma"])
     assert radius["unit"] == "m"
-    assert found["parameters"]["vehicle.body.cg_height_m"]["status"] == "not told"
+    assert found["parameters"]["vehicle.body.cg_height_m"]["status"] == "not identified"
     assert len(found["correlation"]) == 3
     robot = load_vehicle(out / "vehicle.yaml")
     assert robot.wheel.radius_m == radius["value"]

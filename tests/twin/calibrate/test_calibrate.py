@@ -126,7 +126,7 @@ def test_four_logs_halve_sigma() -> None:
 def test_what_is_not_identified_keeps_its_value() -> None:
     height = "vehicle.body.cg_height_m"
     found = calibrate(drive(), "elevate", SOIL, (*NAMES, height))
-    assert found[height].status == "not told"
+    assert found[height].status == "not identified"
     assert found[height].value == nominal().value(height)
     assert found[height].sigma == pytest.approx(0.1, rel=0.02)
     assert any(height in direction.sentence for direction in found.identifiability.weak)
@@ -147,7 +147,7 @@ def test_two_that_act_as_one_are_reported_in_combination() -> None:
     names = (f"{SOIL}.pressure.k_c_n_per_m_n1", f"{SOIL}.pressure.k_phi_n_per_m_n2")
     priors = {names[0]: Prior(1e5, 5e4)}
     found = calibrate(drive(noiseless=True), "elevate", SOIL, (*NAMES, *names), priors=priors)
-    assert {found[name].status for name in names} <= {"only in combination", "not told", "told"}
+    assert {found[name].status for name in names} <= {"only in combination", "not identified", "identified"}
     pair = found.identifiability.weak[0]
     assert set(pair.weights) == set(names)
     assert "only in combination" in pair.sentence

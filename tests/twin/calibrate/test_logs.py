@@ -53,7 +53,7 @@ def test_two_labelled_grounds_in_one_log() -> None:
     found = calibrate(run.recording, "elevate", None, ("soil.shear.shear_modulus_m", *NAMES[1:2]))
     assert found.converged()
     assert [f.name for f in found.fitted] == list(truth)
-    assert all(f.status == "told" for f in found.fitted)
+    assert all(f.status == "identified" for f in found.fitted)
     assert np.max(np.abs(scores(found, truth))) < 3.5
 
 
@@ -71,7 +71,7 @@ def test_an_effect_is_a_parameter(tmp_path) -> None:
     found = calibrate(drive(effect=(key, value)), "elevate", SOIL, (*NAMES, f"effects.{key}"))
     truth = {**TRUTH, f"effects.{key}": value}
     assert found.converged()
-    assert found[f"effects.{key}"].status == "told"
+    assert found[f"effects.{key}"].status == "identified"
     assert np.max(np.abs(scores(found, truth))) < 3.5
     write_files(found, tmp_path, "elevate")
     assert load_vehicle(tmp_path / "vehicle.yaml").effects == {key: found[f"effects.{key}"].value}
