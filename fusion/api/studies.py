@@ -57,7 +57,7 @@ def benchmark(
 ) -> pd.DataFrame:
     """Compare adaptive weights with fixed ones and other baselines; one row a drive and method.
 
-    Writes benchmark.json, benchmark.md, ratios.png and report.html into `out`, as `terrafusion benchmark`.
+    Writes benchmark.json, benchmark.md and report.html into `out`, as `terrafusion benchmark`.
 
     Args:
         out: folder of the results; a benchmark that was interrupted continues there.

@@ -19,7 +19,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for the results; an interrupted benchmark continues.",
-    ("config.json", "parts", "benchmark.json", "benchmark.md", "ratios.png", "report.html"),
+    ("config.json", "parts", "benchmark.json", "benchmark.md", "report.html"),
     ("parts",),
     goes_on=True,
 )
@@ -41,7 +41,7 @@ def benchmark(
     """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.
 
     Methods: data sheet, fixed (tuned), robust, innovation, adaptive, and adaptive with true, shuffled and
-    adversarial ground labels. Writes benchmark.json, benchmark.md, ratios.png and report.html.
+    adversarial ground labels. Writes benchmark.json, benchmark.md and report.html.
 
     Example: terrafusion benchmark --out results --quick
 

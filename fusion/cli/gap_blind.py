@@ -27,7 +27,6 @@ OUTPUT = Output(
         "answers.*",
         "oracle.jsonl",
         "blind.json",
-        "sheet.png",
         "report.html",
     ),
     ("labels.sealed",),
@@ -55,7 +54,7 @@ def gap_blind(
     """Judge the gap diagnosis on trials whose truth is sealed until all answers are given.
 
     The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
-    Writes commitment.json first, answers.jsonl, then blind.json, sheet.png and report.html.
+    Writes commitment.json first, answers.jsonl, then blind.json and report.html.
 
     Examples:
 

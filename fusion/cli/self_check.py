@@ -11,7 +11,6 @@ from terrafusion.fusion.cli.command import Result
 EXTRAS = {
     "compiler": ("ziglang", "a C compiler for the twin, where the machine has none"),
     "parquet": ("pyarrow", "`terrafusion sweep`"),
-    "plots": ("matplotlib", "pictures in the reports of `study`, `benchmark` and `gap-blind`"),
     "learn": ("sklearn", "`terrain train LOGS` and `terrain eval LOGS`"),
     "rerun": ("rerun", "`replay --rerun`, for the Rerun viewer"),
     "cluster": ("distributed", "`--backend dask` of sweep, study, benchmark, gap-blind and terrain train"),

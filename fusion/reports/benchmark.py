@@ -2,7 +2,6 @@
 
 benchmark.json   every row, comparison and target, with its provenance
 benchmark.md     the tables; with `--docs` also the document made of them
-ratios.png       the figure, where matplotlib is installed
 report.html      tables and figure in one page
 parts/           the rows of single jobs, from which a stopped run continues
 """
@@ -28,14 +27,15 @@ from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports.benchmark_tables import Section, tables
-from terrafusion.fusion.reports.page import Tile, VerdictBox, drawn, write_page, write_png, write_text
+from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 SCHEMA = "terrafusion.benchmark/1"
 MARK = "<!-- what follows is written by terrafusion benchmark --docs -->"
 CAPTION = (
-    "Position error in the outage over that of the fixed noise tuned on the training drives. "
-    "The diamond is the adaptive weighting with the detected terrain."
+    "Position error in the outage over that of the fixed noise tuned on the training drives: median of the "
+    "pairs and its 95 % interval. The filled dot is the adaptive weighting with the detected terrain."
 )
 
 
@@ -48,14 +48,12 @@ def write_benchmark(out: Path, result: BenchmarkResult, origin: Mapping[str, str
     sections = tables(result.rows)
     write_text(out / "benchmark.json", to_json(_content(result, origin), indent=1) + "\n")
     write_text(out / "benchmark.md", "\n".join(document_lines(sections, result, origin)) + "\n")
-    ratios, judged = drawn(lambda: plot_ratios(contrasts(result.rows))), targets(result.rows)
-    if ratios is not None:
-        write_png(out / "ratios.png", ratios, dpi=110)
+    judged, sheet = targets(result.rows), Sheet()
+    plot_ratios(sheet, contrasts(result.rows))
     write_page(
         out / "report.html", "benchmark.html.j2", "Fixed against adaptive weighting",
         verdicts=[_verdict(judged)], tiles=_tiles(judged), provenance=origin, packages=LIBRARIES,
-        tables=sections, ratios=ratios, caption=CAPTION,
-        refused=[one.line for one in result.refused],
+        tables=sections, caption=CAPTION, refused=[one.line for one in result.refused], **sheet.parts(),
     )  # fmt: skip
     return sections
 

@@ -1,12 +1,13 @@
-"""`report.html` of a blind check, its figure sheet, and its summary as text."""
+"""`report.html` of a blind check, and its summary as text."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, drawn, write_page, write_png
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page
 from terrafusion.fusion.reports.plots import blind as plots
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 Scores = Mapping[str, Any]
 VERDICTS = ["no_gap", "effect", "ambiguous", "parameters", "unknown", "crash"]
@@ -15,19 +16,18 @@ MET = {True: "met", False: "missed", None: ""}
 
 
 def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | None = None) -> None:
-    """`report.html` and, where matplotlib is installed, `sheet.png` in the folder `out`.
+    """`report.html` in the folder `out`.
 
     Raises:
         TerrafusionError: the folder cannot be written.
     """
-    sheet = drawn(lambda: plots.plot_sheet(scores))
-    if sheet is not None:
-        write_png(out / "sheet.png", sheet)
+    sheet = Sheet()
+    plots.draw(sheet, scores)
     own = scores["figures"]["diagnosis"]
     lead = (
         f"{len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
         "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
-        f"all answers were in. Plant {plots.plant_name(scores)}."
+        f"all answers were in. Plant {plant_name(scores)}."
     )
     write_page(
         out / "report.html", "blind.html.j2", f"Blind check of the diagnosis, {scores['trials']} trials",
@@ -39,7 +39,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
              MET[row["diagnosis"]["met"]]]
             for row in scores["headline"]
         ],
-        sheet=sheet, kinds=VERDICTS,
+        kinds=VERDICTS,
         families=[
             [family, *(str(counts.get(kind, 0)) for kind in VERDICTS)]
             for family, counts in own["verdicts"].items()
@@ -50,7 +50,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
                 own["false_alarms"][setting], effects["power"], effects["right"]))]
             for setting, effects in own["settings"].items()
         ],
-        confusion=drawn(lambda: plots.plot_confusion(own["confusion"])),
+        **sheet.parts(),
     )  # fmt: skip
 
 
@@ -79,6 +79,11 @@ def _tiles(scores: Scores) -> list[Tile]:
         )
         for name in TILES
     ]  # fmt: skip
+
+
+def plant_name(scores: Scores) -> str:
+    """First twelve digits of the plant's hash."""
+    return str(scores.get("plant_sha256", "unknown"))[:12]
 
 
 def rounded(value: float | None) -> str:
@@ -114,4 +119,4 @@ def summary(scores: Scores) -> list[str]:
     ]  # fmt: skip
     lines = text_table(["", *methods, "target", ""], rows)
     count = f"{scores['trials']} of {scores.get('planned', scores['trials'])}"
-    return [f"{count} trials of plant {plots.plant_name(scores)}; crashes: {crashes}", *lines]
+    return [f"{count} trials of plant {plant_name(scores)}; crashes: {crashes}", *lines]

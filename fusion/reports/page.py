@@ -1,22 +1,18 @@
 """Reports as HTML: each is one file, and nothing in it points outside.
 
-`templates/` holds the text of the reports. Jinja escapes every value that a template shows; figures become
-SVG inside the file. The same values give the same bytes.
+`templates/` holds the text of the reports. Jinja escapes every value that a template shows; figures are drawn
+by Bokeh's script, which is inside the file. The same values give the same bytes.
 """
 
 from __future__ import annotations
 
-import base64
-import io
 import platform
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.tables import number
@@ -24,13 +20,9 @@ from terrafusion.datasets.core.tables import number
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
-    from matplotlib.figure import Figure
 
-T = TypeVar("T")
 LIBRARIES = ("gtsam", "numpy", "scipy")
 TWIN_LIBRARIES = ("casadi", "numpy", "scipy")
-_PATH_DATA = re.compile(rb' d="[^"]*"')
-_LONG_NUMBER = re.compile(rb"(\.\d\d)\d+")
 
 
 @dataclass(frozen=True)
@@ -83,20 +75,6 @@ def write_text(path: Path, text: str) -> Path:
     return write_atomically(path, lambda part: part.write_text(text, "utf-8", "backslashreplace"))
 
 
-def drawn(draw: Callable[[], T]) -> T | None:
-    """Pictures, or None where matplotlib is not installed: the page then says how to get it."""
-    return None if find_spec("matplotlib") is None else draw()
-
-
-def write_png(path: Path, fig: Figure, dpi: int = 150) -> Path:
-    """Write a figure as PNG.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
-    """
-    return write_atomically(path, lambda part: fig.savefig(part, format="png", dpi=dpi))
-
-
 def versions_of(packages: Sequence[str]) -> dict[str, str]:
     """Versions of Python, of this library and of `packages`."""
     versions = {"Python": platform.python_version()}
@@ -119,7 +97,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"svg": _svg, "number": number, "code": _code}
+    environment.filters |= {"number": number, "code": _code}
     return environment
 
 
@@ -130,14 +108,3 @@ def _code(text: str) -> Markup:
     parts = [escape(part) for part in text.split("`")]
     marked = (Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
     return Markup("").join(marked)
-
-
-def _svg(fig: Figure) -> str:
-    """The figure as a data URI: the same bytes each time, with paths to a hundredth of a point."""
-    import matplotlib
-
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "terrafusion", "svg.fonttype": "path"}):
-        fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    image = _PATH_DATA.sub(lambda match: _LONG_NUMBER.sub(rb"\1", match[0]), buffer.getvalue())
-    return f"data:image/svg+xml;base64,{base64.b64encode(image).decode('ascii')}"

@@ -13,14 +13,15 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from terrafusion.datasets.core.json_text import finite, to_json
-from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, drawn, write_page, write_text
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
+from terrafusion.fusion.reports.plots import study_field as field
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
 from terrafusion.twin.study.published import CASES, FRICTION, SCENARIO, TITLE, VEHICLE, platform_figures
@@ -33,9 +34,6 @@ from terrafusion.twin.study.text import (
     noise_sentence,
     table_cells,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SCHEMA = "terrafusion.study/1"
 BATCH_COLUMNS = (
@@ -138,39 +136,47 @@ def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | Non
     write_page(
         path, "study.html.j2", "The source study, reproduced", lead=lead, provenance=provenance,
         verdicts=[VerdictBox("doubtful" if disagreeing else "good", title, [reason])], tiles=tiles[:3],
-        packages=TWIN_LIBRARIES, figures=drawn(lambda: _figures(study)) or defaultdict(lambda: None),
-        noise=noise_sentence(study),
+        packages=TWIN_LIBRARIES, noise=noise_sentence(study),
         tab4_heads=TAB4_HEAD, tab4=[(case.label, *table_cells(study, case)) for case in CASES],
         disagreement=[(*_statement(row), row.why) for row in disagreeing],
         agreement=[(*_statement(row), row.criterion, row.why) for row in study.rows],
         batch=len(study.batch), stuck=sum(not r.mobile for r in study.batch),
         tab3=_friction_rows(study.batch), assumed_heads=ASSUMED_HEAD, assumed=assumed_rows(study),
         robot=[(f.name, f"{f.study:g} {f.unit}", f"{f.twin:.5g} {f.unit}") for f in platform_figures()],
+        **_figures(study),
     )  # fmt: skip
 
 
-def _figures(study: Study) -> dict[str, Figure]:
+def _figures(study: Study) -> dict[str, Any]:
+    """The figures, and the keys of those that stand together."""
     first, uneven = ({t: of[0] for t, of in runs.items()} for runs in (study.runs, study.uneven))
     noisy = {t: of[0] for t, of in study.noisy.items()}
     common_m, drive = study.study_like().common_m, study.field[0]
     gaussian = {terrain: [run.error(common_m) for run in of] for terrain, of in study.noisy.items()}
-    return {
-        "tab4": plots.plot_tab4(study.runs, gaussian),
-        "mud": plots.plot_mud(first["mud"]),
-        "slip_proxy": plots.plot_slip_proxy(first["mud"], study.uneven["mud"]),
-        "yaw_mud": plots.plot_yaw_rates(uneven, ("mud",)),
-        "sand": plots.plot_sand_speeds(first),
-        "yaw_sand": plots.plot_yaw_rates(uneven, ("loose_sand", "medium_sand")),
-        "gnss": plots.plot_gnss_speeds(first, noisy, common_m),
-        "noise": plots.plot_noise(study.noise),
-        "mobility": plots.plot_mobility(study.batch),
-        "energy": plots.plot_energy(study.batch, study.over_slip),
-        "acceleration": plots.plot_acceleration(drive),
-        "trace": plots.plot_trace(drive),
-        "velocity": plots.plot_velocity(drive),
-        "ground_speed": plots.plot_ground_speed(drive),
-        "imu_speed": plots.plot_imu_speed(study.field),
+    sheet = Sheet(float(first["mud"].profiles.t_s[-1]))
+    plots.plot_tab4(sheet, study.runs, gaussian)
+    plots.plot_mud(sheet, first["mud"])
+    plots.plot_noise(sheet, study.noise)
+    keys = {
+        "sand": plots.plot_sand_speeds(sheet, first),
+        "yaw_sand": plots.plot_yaw_rates(sheet, uneven, ("loose_sand", "medium_sand")),
+        "gnss": plots.plot_gnss_speeds(sheet, first, noisy, common_m),
+        "mobility": plots.plot_mobility(sheet, study.batch),
+        "energy": plots.plot_energy(sheet, study.batch, study.over_slip),
     }
+    profiles = [run.profiles for run in (first["mud"], *study.uneven["mud"])]
+    sheet.begin_axis(1.1 * max(float(p.t_s[p.moving()][-1]) for p in profiles))
+    plots.plot_slip_proxy(sheet, first["mud"], study.uneven["mud"])
+    keys["yaw_mud"] = plots.plot_yaw_rates(sheet, uneven, ("mud",))
+    sheet.begin_axis(float(drive.imu_t_s[-1]))
+    keys |= {
+        "acceleration": field.plot_acceleration(sheet, drive),
+        "trace": field.plot_trace(sheet, drive),
+        "velocity": field.plot_velocity(sheet, drive),
+    }
+    field.plot_ground_speed(sheet, drive)
+    field.plot_imu_speed(sheet, study.field)
+    return {"keys": keys, **sheet.parts()}
 
 
 def _counts_text(number: Mapping[str, int]) -> str:

@@ -1,128 +1,108 @@
-"""Plots of a blind check: power, false alarms by setting, calibration of the confidence, confusion."""
+"""Plots of a blind check: power, false alarms by setting, naming, confidence, confusion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from terrafusion.fusion.reports.plots import style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from terrafusion.fusion.reports.plots.sheet import Sheet, name_ticks
 
 METHOD_COLOURS = {"diagnosis": "#0072b2", "opponent": "#d55e00"}
-DASHES = {"same": "-", "shifted": "--"}
-NAMED = {"right": "right and\nnot unknown", "top1": "class\ntop-1", "top3": "class\ntop-3"}
+FORMS = {"same": "same form", "shifted": "form-shifted"}
+NAMED = {"right": "right and not unknown", "top1": "class top-1", "top3": "class top-3"}
+ALARM_TARGET = 0.05
+CELL_PX = 19
 Scores = Mapping[str, Any]
 
 
-def plot_sheet(scores: Scores) -> Figure:
-    """Four panels: power by d', false alarms by setting, naming, calibration of the confidence."""
-    fig, axes = style.canvases(2, (11.0, 8.0), 2, sharex=False)
-    for draw, ax in zip((plot_power, plot_alarms, plot_named, plot_reliability), axes, strict=True):
-        draw(scores, ax)
-    fig.suptitle(f"{scores['trials']} trials, plant {plant_name(scores)}", fontsize="small")
-    return fig
+def draw(sheet: Sheet, scores: Scores) -> None:
+    """All figures of a check."""
+    figures = scores["figures"]
+    power = {
+        method: {
+            f"d' {float(d):g}, {form}": rate
+            for family, form in FORMS.items()
+            for d, rate in found["power"][family].items()
+        }
+        for method, found in figures.items()
+    }
+    plot_rates(sheet, "power", "share of trials whose change is detected", power)
+    alarms = {method: found["false_alarms"] for method, found in figures.items()}
+    plot_rates(sheet, "alarms", "share of trials without a change", alarms, ALARM_TARGET)
+    named = {
+        method: {
+            f"{label}, {form}": found[name][family]
+            for name, label in NAMED.items()
+            for family, form in FORMS.items()
+        }
+        for method, found in figures.items()
+    }
+    plot_rates(sheet, "named", "share of detected trials", named)
+    plot_reliability(sheet, figures["diagnosis"]["confidence"])
+    plot_confusion(sheet, figures["diagnosis"]["confusion"])
 
 
-def plant_name(scores: Scores) -> str:
-    """First twelve digits of the plant's hash."""
-    return str(scores.get("plant_sha256", "unknown"))[:12]
+def plot_rates(
+    sheet: Sheet, key: str, about: str, rates: Mapping[str, Mapping[str, Any]], target: float | None = None
+) -> None:  # fmt: skip
+    """A named rate a row with its interval, of each method; a line at the target."""
+    names = list(next(iter(rates.values())))
+    plot = sheet.add_rows(f"rows {key}", about, names, 20 + 16 * len(rates), x_range=(-0.02, 1.02))
+    if target is not None:
+        edge = np.array([-0.5, len(names) - 0.5])
+        plot.line(np.full(2, target), edge, "target", style.TRUTH_ON_ANY, dash="dotted")
+    for k, (method, found) in enumerate(rates.items()):
+        known = [i for i, name in enumerate(names) if found[name]["rate"] is not None]
+        rows = np.array(known, dtype=float) + 0.3 * (k - 0.5 * (len(rates) - 1))
+        some = [found[names[i]] for i in known]
+        value, low, high = (np.array([rate[word] for rate in some]) for word in ("rate", "low", "high"))
+        text = [f"{r['hits']} of {r['count']} ({r['low']:.2f} to {r['high']:.2f})" for r in some]
+        plot.intervals(rows, value, low, high, method, METHOD_COLOURS[method], text=text)
 
 
-def plot_power(scores: Scores, ax: Axes) -> None:
-    """Share detected over d' of the oracle, one line a method and form."""
-    shift = 0.97
-    for method, figures in scores["figures"].items():
-        for family, dash in DASHES.items():
-            cells = figures["power"][family]
-            x = shift * np.array([float(d) for d in cells])
-            label = f"{method}, {'same form' if family == 'same' else 'form-shifted'}"
-            _rates(ax, x, list(cells.values()), fmt=f"o{dash}", color=METHOD_COLOURS[method], label=label)
-            shift *= 1.02
-    ax.set_xscale("log")
-    ax.minorticks_off()
-    ax.set_xticks([5, 10, 25], ["5", "10", "25"])
-    ax.set_ylim(-0.03, 1.05)
-    ax.legend(fontsize=7, frameon=False, loc="lower right")
-    style.format_axes(ax, x="d' of the oracle", y="share detected", title="Detected")
-
-
-def plot_alarms(scores: Scores, ax: Axes) -> None:
-    """False alarms by setting."""
-    names = list(scores["figures"]["diagnosis"]["false_alarms"])
-    for k, (method, figures) in enumerate(scores["figures"].items()):
-        rates, at = list(figures["false_alarms"].values()), np.arange(len(names)) + 0.2 * k
-        _rates(ax, at, rates, fmt="o", color=METHOD_COLOURS[method], label=method)
-    ax.axhline(0.05, color=style.NEUTRAL, linewidth=0.8, linestyle=":")
-    _legend_above(ax)
-    style.format_axes(ax, y="share of trials without effect", title="False alarms (dotted: target)")
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="right")
-    ax.tick_params(axis="x", labelsize=7)
-
-
-def plot_named(scores: Scores, ax: Axes) -> None:
-    """Share of detected trials whose truth is named."""
-    labels = [f"{label}\n{family}" for label in NAMED.values() for family in DASHES]
-    for k, (method, figures) in enumerate(scores["figures"].items()):
-        rates = [figures[name][family] for name in NAMED for family in DASHES]
-        at = np.arange(len(rates)) + 0.2 * k
-        _rates(ax, at, rates, fmt="o", color=METHOD_COLOURS[method], label=method)
-    _legend_above(ax)
-    style.format_axes(ax, y="share of detected trials", title="Named")
-    ax.set_xticks(range(len(labels)), labels)
-    ax.tick_params(axis="x", labelsize=7)
-
-
-def plot_reliability(scores: Scores, ax: Axes) -> None:
+def plot_reliability(sheet: Sheet, confidence: Mapping[str, Any]) -> None:
     """Share that was right over stated confidence of the diagnosis, dots as large as their count."""
-    ax.plot([0, 1], [0, 1], color=style.NEUTRAL, linewidth=0.8)
-    for family, dash in DASHES.items():
-        confidence = scores["figures"]["diagnosis"]["confidence"][family]
-        if not confidence["bins"]:
+    limits: dict[str, Any] = {"x_range": (-0.03, 1.03), "y_range": (-0.03, 1.05)}
+    plot = sheet.add("p confidence", "stated confidence in the first class", "share that was right", **limits)
+    ends = np.array([0.0, 1.0])
+    plot.line(ends, ends, "as stated", style.TRUTH_ON_ANY, width=1.0)
+    for family, colour in zip(FORMS, (style.AFTER, style.BEFORE), strict=True):
+        if not confidence[family]["bins"]:
             continue
-        stated, true, count = np.array(confidence["bins"]).T
-        label = f"{family}: ECE {confidence['ece']:.3f}, Brier {confidence['brier']:.3f}"
-        ax.plot(stated, true, dash, color=METHOD_COLOURS["diagnosis"], linewidth=1.0, label=label)
-        ax.scatter(stated, true, s=10.0 + 4.0 * count, color=METHOD_COLOURS["diagnosis"], alpha=0.7)
-    ax.set_xlim(0.0, 1.03)
-    ax.set_ylim(-0.03, 1.05)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=7, frameon=False, loc="lower right")
-    x, y = "stated confidence of the first class", "share that was right"
-    style.format_axes(ax, x=x, y=y, title="Confidence")
+        stated, true, count = np.array(confidence[family]["bins"]).T
+        numbers = "ECE {ece:.3f}, Brier {brier:.3f}".format(**confidence[family])
+        label = f"{FORMS[family]}: {numbers}"
+        plot.line(stated, true, label, colour)
+        data = {"x": stated, "y": true, "size": 4.0 + 2.0 * np.sqrt(count)}
+        tips = {"stated": "@x{0.##}", "right": "@y{0.##}", "trials": "@count"}
+        more = {"count": count.astype(int)}
+        plot.glyph("scatter", data, label, colour, "line", more=more, tips=tips, fill_alpha=0.5)
 
 
-def plot_confusion(table: Mapping[str, Mapping[str, int]]) -> Figure:
-    """Confusion matrix: true effects in rows, the effect ranked first in columns, counts in cells."""
+def plot_confusion(sheet: Sheet, table: Mapping[str, Mapping[str, int]]) -> None:
+    """True effects in rows, the effect ranked first in columns, coloured by the share of the row."""
+    from bokeh.palettes import Blues256
+
     rows, answers = list(table), {name for counts in table.values() for name in counts}
     columns = [name for name in rows if name in answers] + sorted(answers - set(rows))
+    if not columns:
+        return
     values = np.array([[table[row].get(column, 0) for column in columns] for row in rows], dtype=float)
     share = values / np.maximum(values.sum(axis=1, keepdims=True), 1.0)
-    fig, ax = style.canvas((2.5 + 0.24 * len(columns), 2.2 + 0.2 * len(rows)))
-    ax.imshow(share, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
-    for (i, j), count in np.ndenumerate(values):
-        if count:
-            colour = "white" if share[i, j] > 0.6 else "black"
-            ax.text(j, i, f"{count:.0f}", ha="center", va="center", fontsize=6, color=colour)
-    ax.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
-    ax.set_yticks(range(len(rows)), rows, fontsize=7)
-    ax.set_xlabel("ranked first", fontsize=9)
-    ax.set_ylabel("true", fontsize=9)
-    return fig
-
-
-def _rates(ax: Axes, x: Any, rates: Sequence[Mapping[str, Any]], **options: Any) -> None:
-    y = np.array([r["rate"] if r["rate"] is not None else np.nan for r in rates])
-    bars = np.array([[v - r["low"], r["high"] - v] for v, r in zip(y, rates, strict=True)]).T
-    ax.errorbar(x, y, yerr=np.maximum(bars, 0.0), markersize=4, linewidth=1.2, capsize=2, **options)
-
-
-def _legend_above(ax: Axes) -> None:
-    """Shares from 0 to 1, and room for the legend over them."""
-    ax.set_ylim(-0.03, 1.2)
-    ax.set_yticks(np.linspace(0.0, 1.0, 6))
-    ax.legend(fontsize=7, frameon=False, loc="upper left", ncol=2)
+    x, y = (np.arange(-0.5, n) for n in (len(columns), len(rows)))
+    plot = sheet.add_rows("cells confusion", "ranked first", rows, CELL_PX, x_range=(x[0], x[-1]))
+    fig = plot.panel.figure
+    fig.height += 150
+    plot.panel.height = fig.height
+    texts = [
+        f"{count:.0f} of {total:.0f}: {row} ranked as {column}"
+        for row, counts, total in zip(rows, values, values.sum(axis=1), strict=True)
+        for column, count in zip(columns, counts, strict=True)
+    ]
+    plot.cells(x, y, np.where(values > 0, share, np.nan), Blues256[::-1][40:], limits=(0.0, 1.0), texts=texts)
+    name_ticks(fig.xaxis, columns)
+    fig.xaxis.major_label_orientation = 1.2
+    fig.xgrid.visible = False

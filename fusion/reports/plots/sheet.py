@@ -218,10 +218,11 @@ class Plot:
 
     def intervals(
         self, rows: Array, values: Array, low: Array, high: Array, label: str, colour: str, *,
-        hollow: bool = False,
+        hollow: bool = False, text: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
-        """Dots with their intervals, at rows of `Sheet.add_rows`."""
-        text = [f"{v:.3g} [{a:.3g}, {b:.3g}]" for v, a, b in zip(values, low, high, strict=True)]
+        """Dots with their intervals, at rows of `Sheet.add_rows`; `text` is what the pointer shows."""
+        if text is None:
+            text = [f"{v:.3g} [{a:.3g}, {b:.3g}]" for v, a, b in zip(values, low, high, strict=True)]
         self.glyph(
             "segment", {"x0": low, "x1": high, "y0": rows, "y1": rows}, label, colour, "dot", line_width=2
         )
@@ -232,9 +233,13 @@ class Plot:
 
     def cells(
         self, x: Array, y: Array, values: Array, palette: Sequence[str], *, log: bool = False,
-        limits: tuple[float, float] | None = None,
+        limits: tuple[float, float] | None = None, texts: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
-        """A heat map of values (rows, columns) over edges x (columns + 1,), y (rows + 1,); NaN is grey."""
+        """A heat map of values (rows, columns) over edges x (columns + 1,), y (rows + 1,); NaN is grey.
+
+        Args:
+            texts: what the pointer shows, row by row; by default the value and its place.
+        """
         from bokeh.models import ColorBar, LinearColorMapper, LogColorMapper
 
         known = values[np.isfinite(values)]
@@ -244,10 +249,11 @@ class Plot:
         row, column = (index.ravel() for index in np.indices(values.shape))
         at = {"left": x[column], "right": x[column + 1], "bottom": y[row], "top": y[row + 1]}
         value = values.ravel()
-        text = [f"{one:.3g}" if np.isfinite(one) else "none" for one in value]
+        text = texts or [f"{one:.3g}" if np.isfinite(one) else "none" for one in value]
         middle = {"x": 0.5 * (x[column] + x[column + 1]), "y": 0.5 * (y[row] + y[row + 1])}
         fig = self.panel.figure
         places = {fig.xaxis[0].axis_label: "@x{0.###}", fig.yaxis[0].axis_label: "@y{0.###}"}
+        places = {} if texts else places
         self.glyph(
             "quad", at, "", {"field": "value", "transform": mapper}, "area",
             line_width=0, more={"value": value, "text": text} | middle,

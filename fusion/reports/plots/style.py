@@ -1,4 +1,4 @@
-"""Colours and helpers that all plots share. matplotlib is imported only when something is drawn.
+"""Colours and helpers that all plots share.
 
 The colours start from Okabe and Ito (2008, "Color Universal Design"), which readers with the common kinds of
 colour blindness can tell apart; terrains that are alike in hue differ in lightness.
@@ -8,18 +8,12 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
-
 
 TERRAIN_COLOURS = {
     "asphalt": "#4d4d4d",
@@ -55,12 +49,10 @@ TRUTH, HELD_OUT, NEUTRAL = "#1a1a1a", "#cc3311", "#7f7f7f"
 TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#e69f00"
 """The same where the background may be light or dark."""
 BEFORE, AFTER = "#d55e00", "#0072b2"
-EXPECTED = "#dddddd"
 LINE_LUMINANCE = (0.13, 0.29)
 """Relative luminance (WCAG 2.1) of lines that stand out on a light and on a dark page."""
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
 
-TIME = "time from the start, s"
 MAX_POINTS = 1200
 """Longer lines are thinned to this many points before they are drawn."""
 
@@ -89,66 +81,10 @@ def line_colour(colour: str) -> str:
     return "#" + "".join(f"{round(255.0 * x):02x}" for x in rgb)
 
 
-def canvas(size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:
-    """A new figure of `size`, inches, and its axes; pyplot's list of figures is not touched."""
-    fig, axes = canvases(1, size)
-    return fig, axes[0]
-
-
-def canvases(
-    rows: int, size: tuple[float, float], columns: int = 1, *, sharex: bool = True
-) -> tuple[Figure, list[Axes]]:
-    """A new figure of `size`, inches, and its axes row by row."""
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=size, layout="constrained")
-    return fig, list(fig.subplots(rows, columns, sharex=sharex, squeeze=False).flat)
-
-
-def format_axes(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
-    """Axis labels, a light grid and no box."""
-    ax.set_xlabel(x, fontsize=9)
-    ax.set_ylabel(y, fontsize=9)
-    if title:
-        ax.set_title(label_text(title), fontsize=10, loc="left")
-    ax.tick_params(labelsize=8)
-    ax.grid(True, color="#e0e0e0", linewidth=0.6)
-    ax.set_axisbelow(True)
-    ax.margins(x=0.01)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-
-
-def legend_above(ax: Axes, *, columns: int = 8, handles: Sequence[Any] | None = None) -> None:
-    """The legend in rows above the plot, where it hides no data."""
-    handles = ax.get_legend_handles_labels()[0] if handles is None else handles
-    if handles:
-        ax.legend(
-            handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(columns, len(handles)),
-            frameon=False, fontsize=8, handlelength=1.4, columnspacing=1.2, borderaxespad=0.1,
-        )  # fmt: skip
-
-
-def line(ax: Axes, t_s: Array, values: Array, colour: str, label: str | None = None, **options: Any) -> None:
-    """A line, thinned to `MAX_POINTS`."""
-    rows = thin(len(t_s))
-    ax.plot(t_s[rows], values[rows], color=colour, label=label, **({"linewidth": 1.2} | options))
-
-
-def plain_log_ticks(axis: Axis) -> None:
-    """Ticks of a logarithmic axis as 200 instead of 2 x 10^2."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
 def label_text(text: object, limit: int = 60) -> str:
-    """Text from a log for a label: one short line, no mathematics, and not hidden from the legend."""
-    words = " ".join(str(text).split()).lstrip("_") or "unnamed"
-    words = words if len(words) <= limit else words[: limit - 1] + "…"
-    return words.replace("$", r"\$")
+    """Text from a log for a label: one short line."""
+    words = " ".join(str(text).split()) or "unnamed"
+    return words if len(words) <= limit else words[: limit - 1] + "…"
 
 
 def thin(n: int, most: int = MAX_POINTS, keep: Iterable[int] = ()) -> NDArray[np.int64]:

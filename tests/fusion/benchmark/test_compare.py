@@ -15,6 +15,7 @@ from terrafusion.fusion.benchmark.run_score import GroundScore, RunScore, switch
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, pooled_nees, targets
 from terrafusion.fusion.reports.benchmark_tables import tables
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 
 def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[RunScore]:
@@ -91,7 +92,10 @@ def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -
     assert {t.verdict() for t in targets(base + own)} == {OPEN}
     text = "\n".join(line for table in tables(base + own) for line in table.markdown())
     assert "inf [0.50, inf]" in text
-    plot_ratios(contrasts(base + own)).canvas.draw()
+    sheet = Sheet()
+    plot_ratios(sheet, contrasts(base + own))
+    assert set(sheet.panels["ratios"].legend) == {"as large as that of fixed", "adaptive"}
+    assert '"inf [0.5, inf]"' in sheet.json()
     assert shares(base + own + rows("oracle", np.full(12, 0.4)))[0].share == -np.inf
 
 

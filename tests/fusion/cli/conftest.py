@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,12 +61,3 @@ def odd_files(tmp_path: Path) -> None:
     (tmp_path / "ros2").mkdir()
     (tmp_path / "ros2" / "metadata.yaml").write_text("rosbag2_bagfile_information: 5\n")
     (tmp_path / "notes.txt").write_text("hello")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def without_matplotlib(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Commands do without the extra `plots`, but for the pictures of `study`."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not request.module.__name__.endswith("test_study"):
-            patch.setitem(sys.modules, "matplotlib", None)
-        yield

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 from jinja2 import UndefinedError
 
-from terrafusion.fusion.reports import page
 from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page
 
 HOSTILE = "<script>alert('x')</script>"
@@ -37,14 +35,3 @@ def test_a_missing_value_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(UndefinedError, match="groups"):
         sweep_page(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_without_matplotlib_a_page_says_how_to_get_its_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "find_spec", lambda name: None)
-    assert page.drawn(lambda: pytest.fail("drawn")) is None
-    text = "{% from 'macros.html.j2' import figure %}{{ figure(figures.tab4, 'Tab. 4') }}"
-    made = page._environment().from_string(text).render(figures=defaultdict(lambda: None))
-    assert "pip install 'terrafusion[plots]'" in made
-    templates = Path(page.__file__).parent / "templates"
-    drawn = {path.name for path in templates.glob("*.html.j2") if "figure(" in path.read_text()}
-    assert drawn == {"benchmark.html.j2", "blind.html.j2", "study.html.j2", "macros.html.j2"}

@@ -332,7 +332,7 @@ def test_important_changes_are_the_largest_apart_and_in_order():
 def test_style_helpers():
     assert colour_of("mud", {"mud": "#123456"}) == "#123456"
     assert colour_of("ice", {}) == colour_of("ice", {})
-    assert label_text("_a\n$b") == r"a \$b"
+    assert label_text(" a\nb") == "a b"
     rows = thin(100_000, 100, keep=[77])
     assert rows[0] == 0
     assert rows[-1] == 99_999

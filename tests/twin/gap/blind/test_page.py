@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import pytest
 
 from terrafusion.fusion.reports.blind import summary, write_blind
 from terrafusion.fusion.reports.plots import blind as plots
-from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.gap.blind.plan import FULL, CheckSize, plan
 from terrafusion.twin.gap.blind.score import score
+from tests.fusion.reports.browser import assert_drawn
 from tests.twin.gap.blind import blind_answers as fake
 
 
@@ -40,16 +42,17 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
     ):
         assert words in page
     assert page.count('class="tile"') == 3
-    assert "://" not in page
-    assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
+    assert re.findall(r'id="plot-(\w+)"', page) == ["power", "alarms", "named", "confidence", "confusion"]
+    assert_drawn(tmp_path / "report.html")
     told = summary(scores)
     assert any(
         "false alarms, same drives" in line and "0 of 200" in line and "200 of 200" in line for line in told
     )
     assert sum(line.endswith("met") for line in told) >= 12
-    _, ax = style.canvas()
-    plots.plot_power(scores, ax)
-    assert len(ax.containers) == 4  # two methods, two forms
+    sheet = Sheet()
+    plots.draw(sheet, scores)
+    assert set(sheet.panels["power"].legend) == {"diagnosis", "opponent"}
+    assert "0 of 200 (0.00 to 0.02)" in sheet.json()
 
 
 def test_the_page_of_a_check_without_answers(tmp_path: Path) -> None:
