@@ -21,8 +21,9 @@ from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.baselines import Baselines, baselines
+from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import Outage, Scores, score
-from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
+from terrafusion.fusion.metrics.verdict import Verdict, judge
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -112,8 +113,8 @@ def replay(
 
     rig = drive.config.rig
     found = run_checks(recording, rig) if findings is None else findings
-    delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
-    verdict = judge(Run(recording, estimate, scores, alone, drive.used, found, rig, delay_s, corrected))
+    corrections = estimator.learned.corrections()
+    verdict = judge(Run(recording, estimate, scores, alone, drive.used, found, rig, corrections))
     return ReplayResult(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
         drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,

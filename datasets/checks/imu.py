@@ -77,7 +77,15 @@ def gravity(context: CheckContext) -> Array | None:
     imu = context.recording.imu
     if imu is None or not imu.has_accel() or len(imu) < 10:
         return None
-    return np.asarray(np.nanmean(imu.accel_mps2, axis=0))
+    return np.asarray(_mounting(context) @ np.nanmean(imu.accel_mps2, axis=0))
+
+
+def _mounting(context: CheckContext) -> Array:
+    """Rotation (3, 3) of the IMU's readings into body axes, as far as the vehicle file knows its angles."""
+    from scipy.spatial.transform import Rotation
+
+    angles = [context.known(f"imu_{name}_rad") for name in ("roll", "pitch", "yaw")]
+    return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
 def is_metric(mean: Array) -> bool:
@@ -259,7 +267,8 @@ def heading(context: CheckContext) -> ForceHeading | None:
     imu = context.recording.imu
     if imu is None or not is_upright(context):
         return None
-    return heading_of(context, imu.accel_mps2[:, :2], imu.gyro_radps[:, 2])
+    R = _mounting(context)
+    return heading_of(context, (imu.accel_mps2 @ R.T)[:, :2], (imu.gyro_radps @ R.T)[:, 2])
 
 
 def turning_axis(context: CheckContext) -> str | None:

@@ -172,7 +172,7 @@ def _shown(result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[s
 
 def _warning(finding: Finding, learned: Sequence[NumberAfterDrive]) -> str:
     """A finding of the log checks as a line, with its remedy unless the drive gave it."""
-    from terrafusion.fusion.metrics.verdict import LEARNED
+    from terrafusion.fusion.metrics.verdict_of_numbers import LEARNED
 
     settling = LEARNED.get((finding.code, finding.channel))
     corrected = any(number.corrects and number.state == settling for number in learned)

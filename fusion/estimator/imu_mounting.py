@@ -39,7 +39,7 @@ class ImuMounting:
     Attributes:
         learns: an estimator of six axes, with self-calibration.
         before: what was known before the drive; known: now, as it is used.
-        corrects: the samples are turned by what the drive showed.
+        corrects_since_ns: since when samples are turned by what the drive showed; None where they are not.
     """
 
     def __init__(self, config: EstimatorConfig, imu: ImuStream, skid: SkidDetector) -> None:
@@ -47,9 +47,14 @@ class ImuMounting:
         self._imu, self._skid, self._seen = imu, skid, MountingAngle()
         spec = config.rig.sensors.imu
         self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
-        self.corrects = False
+        self.corrects_since_ns: int | None = None
         self.start_from(_prior(config.rig.known.imu_yaw_rad))
         imu.level = level_rotation(config.rig.known) if config.inputs.imu == "six_axis" else None
+
+    @property
+    def corrects(self) -> bool:
+        """Whether samples are turned by what the drive showed."""
+        return self.corrects_since_ns is not None
 
     def start_from(self, before: Angle) -> None:
         """Begin with what is known of the robot."""
@@ -74,20 +79,21 @@ class ImuMounting:
         if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
             return False
         was_rad = self._imu.mounting_rad
-        self.known = self._in_use(self.before.combined(self._seen.angle))
+        self.known = self._in_use(self.before.combined(self._seen.angle), chain.nodes[-1].t_ns)
         self._imu.mounting_rad = self.known.rad
         if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
             return False
         chain.restart(self._doubt(chain.dim, bias.vector()))
         return True
 
-    def _in_use(self, found: Angle) -> Angle:
+    def _in_use(self, found: Angle, now_ns: int) -> Angle:
         """What was found where that is clear, else what was known before, its sigma with the difference."""
         off = abs(math.remainder(found.rad - self.before.rad, math.tau))
         limit = max(CLEAR_SIGMA * found.sigma_rad, LEAST_RAD)
-        self.corrects = off > (STILL_CLEAR * limit if self.corrects else limit)
-        if self.corrects:
+        if off > (STILL_CLEAR * limit if self.corrects else limit):
+            self.corrects_since_ns = self.corrects_since_ns or now_ns
             return found
+        self.corrects_since_ns = None
         return Angle(self.before.rad, min(math.hypot(off, found.sigma_rad), self.before.sigma_rad))
 
     def _doubt(self, dim: int, bias: Array) -> Array:

@@ -27,6 +27,7 @@ from terrafusion.fusion.calibration.numbers import (
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
@@ -176,12 +177,15 @@ class LearnedNumbers:
             numbers.append(NumberAfterDrive("imu_yaw_rad", angle.rad, *sigmas, self.mounting.corrects))
         return tuple(numbers)
 
-    def corrected(self) -> frozenset[str]:
-        """Names of the numbers that correct a sensor."""
-        return frozenset(number.state for number in self.table() if number.corrects)
+    def corrections(self) -> Corrections:
+        """What the drive refuted of the robot's numbers."""
+        numbers = frozenset(number.state for number in self.table() if number.corrects)
+        mounting, places = self.mounting, self._gnss.antenna_places
+        sigma_rad = mounting.known.sigma_rad if mounting.learns else None
+        since_ns, delay_s = mounting.corrects_since_ns, self._uncorrected_delay_s()
+        return Corrections(numbers, since_ns, sigma_rad, places, delay_s)
 
-    def uncorrected_delay_s(self) -> tuple[float, float] | None:
-        """Lateness of the fixes beyond what was known, 1 sigma; None where corrected or not learned."""
+    def _uncorrected_delay_s(self) -> tuple[float, float] | None:
         if self.calibration is None or self._clear[CORRECTED.index(GNSS_DELAY)]:
             return None
         delay_s = self._known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY]

@@ -18,8 +18,9 @@ from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
 from terrafusion.fusion.metrics.baselines import baselines
+from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import score
-from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
+from terrafusion.fusion.metrics.verdict import Verdict, judge
 from terrafusion.twin.model.choose import choose_vehicle
 
 
@@ -90,8 +91,8 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
         antenna_m=antenna_m, aligned=local,
     )  # fmt: skip
     found = run_checks(recording, rig)
-    delay_s, corrected = estimator.learned.uncorrected_delay_s(), estimator.learned.corrected()
-    return judge(Run(recording, estimate, scores, alone, recording.gnss, found, rig, delay_s, corrected))
+    corrections = estimator.learned.corrections()
+    return judge(Run(recording, estimate, scores, alone, recording.gnss, found, rig, corrections))
 
 
 def run(

@@ -5,44 +5,49 @@ own covariance. The limits are constants below; docs/reference/verdict.md lists 
 """
 
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import binom
 
-from terrafusion.datasets.checks import CheckContext, Finding
+from terrafusion.datasets.checks import CheckContext
 from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import SMALL, is_firm
 from terrafusion.datasets.core.channels import Gnss
-from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.estimate.estimate import STATUS, Estimate, Innovation
-from terrafusion.fusion.metrics.baselines import Baselines
+from terrafusion.fusion.estimate.estimate import STATUS
 from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
 from terrafusion.fusion.metrics.error_series import known_keyframes
 from terrafusion.fusion.metrics.health import examine_estimate
-from terrafusion.fusion.metrics.scores import Scores
+from terrafusion.fusion.metrics.judged_run import (
+    DOUBTFUL,
+    FIVE_SIGMA,
+    GOOD,
+    STRAY_SHARE,
+    UNUSABLE,
+    Reason,
+    Run,
+    gnss_innovations,
+    since_s,
+)
+from terrafusion.fusion.metrics.verdict_of_numbers import delayed, log_checks, refuted, unconfirmed_imu
 
-GOOD, DOUBTFUL, UNUSABLE = "good", "doubtful", "not_to_be_used"
 WORDS = {GOOD: "good", DOUBTFUL: "doubtful", UNUSABLE: "not to be used"}
 
 FAR_M, FAR_SHARE = 10.0, 0.05
 """An error of more than 10 m is never good; if it is also more than this share of the distance, plain dead
 reckoning is usually no worse."""
-FIVE_SIGMA = 25.0
-"""e' P^-1 e of an error of five sigma; for a right covariance its chance is exp(-12.5), 4e-6."""
-STRAY_SHARE = 0.01
-"""Share of single samples beyond five sigma that is put down to the reference (its jumps, its stamps)."""
 SIGMA_RATIO = 2.0
 """A sigma is called too small if the errors, after allowing for chance, still show it this many times too
 small: a factor that matters to whoever uses it."""
 NIS_95 = 5.991
 """Chi-square quantile of 95 % for 2 degrees of freedom."""
+GATE_NIS = 13.816
+"""Chi-square quantile of 99.9 % for 2 degrees of freedom: the gate of the fixes."""
 SIGNIFICANT_Z = 3.0
 """Standard errors by which a share must exceed its expectation."""
 IN_A_ROW = 5
-"""Fixes rejected one after the other from which on they are no outliers but a contradiction: the chance of
+"""Fixes beyond the gate one after the other from which on they are no outliers but contradict: the chance of
 it, at a gate of 99.9 %, is 1e-15 for independent errors."""
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
@@ -56,18 +61,6 @@ MOST_PATH_RATIO = 2.0
 """Estimated over rolled path that no wrong radius explains (assumed): fixes have moved the estimate about."""
 SIGMA_KNOWN_M, YAW_SIGMA_KNOWN_RAD = 10.0, 0.5
 """Position and heading are unknown for navigation beyond these 1 sigmas."""
-REPORTED = (
-    "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
-    "sigma-too-small", "standing", "saturated",
-)  # fmt: skip
-"""Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
-the estimator estimates itself, such as small scale errors and the receiver's delay, or cost accuracy only. It
-does not estimate delays of IMU and wheels: an offset of their clocks counts, too."""
-LEARNED = {("imu-forward", "imu"): "imu_yaw_rad", ("clock-offset", "gnss"): "gnss_delay_s"}
-"""The number of the robot that settles a finding of the log checks where the estimator corrected it, by code
-and channel."""
-DELAY_SIGMAS = 2.0
-"""A delay of the fixes is likely from so many of its sigmas on (95 %)."""
 
 
 @dataclass(frozen=True)
@@ -84,27 +77,6 @@ class Verdict:
     def lines(self) -> list[str]:
         """The verdict as lines of text."""
         return [f"verdict: {self.words()}", *(f"  {reason}" for reason in self.reasons)]
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What a verdict is passed on."""
-
-    recording: Recording
-    estimate: Estimate
-    scores: Scores
-    baselines: Baselines
-    used: Gnss | None
-    findings: Sequence[Finding]
-    rig: Rig
-    delay_s: tuple[float, float] | None = None
-    """Lateness of the fixes as learned, and its 1 sigma, where it was not corrected."""
-    corrected: Collection[str] = ()
-    """Numbers of the robot that the estimator corrected by what the drive showed."""
-
-
-Reason = tuple[str, str]
-"""A value and a sentence."""
 
 
 def judge(run: Run) -> Verdict:
@@ -190,7 +162,7 @@ def _five_sigma(run: Run) -> Iterator[Reason]:
     yield (
         value,
         f"the error exceeds five times its own sigma {100.0 * share:.0f} % of the time, up to {off_m:.1f} m "
-        f"at {_since(run, int(errors.t_ns[worst])):.0f} s: sigma is wrong there; compare vehicle file, IMU "
+        f"at {since_s(run, int(errors.t_ns[worst])):.0f} s: sigma is wrong there; compare vehicle file, IMU "
         "mounting and stamps with the log (`terrafusion inspect`)",
     )
 
@@ -257,7 +229,7 @@ def _certain(run: Run) -> Iterator[Reason]:
         yield (
             DOUBTFUL,
             f"the position is known to {sigma[k]:.0f} m only (1 sigma) at "
-            f"{_since(run, int(path.t_ns[k])):.0f} s: without fixes the uncertainty grows",
+            f"{since_s(run, int(path.t_ns[k])):.0f} s: without fixes the uncertainty grows",
         )
     yaw_sigma = float(np.sqrt(path.covariance[-1, 5, 5]))
     if yaw_sigma > YAW_SIGMA_KNOWN_RAD:
@@ -268,7 +240,7 @@ def _certain(run: Run) -> Iterator[Reason]:
 
 
 def _innovations(run: Run) -> Iterator[Reason]:
-    row, fixes = _row(run, "nis gnss"), _gnss(run)
+    row, fixes = _row(run, "nis gnss"), gnss_innovations(run)
     if row is None or not fixes:
         return
     share = float(np.mean([i.nis > NIS_95 for i in fixes]))
@@ -284,7 +256,7 @@ def _innovations(run: Run) -> Iterator[Reason]:
 
 
 def _rejections(run: Run) -> Iterator[Reason]:
-    fixes = _gnss(run)
+    fixes = gnss_innovations(run)
     if not fixes:
         return
     rejected = [not i.accepted for i in fixes]
@@ -295,47 +267,20 @@ def _rejections(run: Run) -> Iterator[Reason]:
             f"{100.0 * share:.0f} % of the fixes were rejected: they contradict wheels and IMU; check "
             "sigmas, stamps and axes with `terrafusion inspect`",
         )
-    longest = _longest(rejected)
+    # The fix that ends a run of rejected ones belongs to it where the estimate gives in to it.
+    against = [
+        not i.accepted or (k > 0 and rejected[k - 1] and i.nis > GATE_NIS) for k, i in enumerate(fixes)
+    ]
+    longest = _longest(against)
     if longest is not None and longest[1] - longest[0] >= IN_A_ROW:
         first, end = longest
         size = float(np.median([np.hypot(*i.value[:2]) for i in fixes[first:end]]))
-        at = _since(run, fixes[first].t_ns)
-        moved = end < len(fixes) and fixes[end].nis > FIVE_SIGMA
+        at = since_s(run, fixes[first].t_ns)
         yield (
             DOUBTFUL,
             f"{end - first} fixes in a row from {at:.0f} s on lie {size:.1f} m off the estimate"
-            + (", which then moved to them" if moved else "")
+            + (", which then moved to them" if fixes[end - 1].accepted else "")
             + ": either they or the estimate are wrong there",
-        )
-
-
-def _log(run: Run) -> Iterator[Reason]:
-    for finding in run.findings:
-        if LEARNED.get((finding.code, finding.channel)) in run.corrected:
-            continue
-        clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
-        if finding.severity == "error" or finding.code in REPORTED or clock:
-            yield (
-                DOUBTFUL,
-                f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}",
-            )
-
-
-def _delayed(run: Run) -> Iterator[Reason]:
-    path = run.estimate.trajectory
-    if run.delay_s is None or path.covariance is None or len(path) < 2:
-        return
-    delay_s, sigma_s = run.delay_s
-    step_m = np.linalg.norm(np.diff(path.position_m[:, :2], axis=0), axis=1)
-    shift_m = abs(delay_s) * step_m / (np.diff(path.t_ns) * 1e-9)
-    variance_m2 = path.covariance[1:, :2, :2].trace(axis1=1, axis2=2) / 2.0
-    beyond = shift_m**2 > FIVE_SIGMA * variance_m2
-    if abs(delay_s) > DELAY_SIGMAS * sigma_s and beyond.mean() > STRAY_SHARE:
-        yield (
-            DOUBTFUL,
-            f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
-            f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, which sigma does not "
-            "include; give the receiver's delay in the vehicle file, or drive longer",
         )
 
 
@@ -353,7 +298,7 @@ def _path_ratio(run: Run) -> Iterator[Reason]:
 
 
 def _unchecked(run: Run) -> Iterator[Reason]:
-    if run.scores.against is not None or _gnss(run):
+    if run.scores.against is not None or gnss_innovations(run):
         return
     missing = _disagreement(run)
     if missing:
@@ -381,7 +326,7 @@ def _disagreement(run: Run) -> str:
 
 TESTS = (
     _sound, _started, _error, _outages, _five_sigma, _nees, _worse_than_a_baseline, _certain, _innovations,
-    _rejections, _delayed, _path_ratio, _log, _unchecked,
+    _rejections, delayed, refuted, unconfirmed_imu, _path_ratio, log_checks, _unchecked,
 )  # fmt: skip
 
 
@@ -392,7 +337,7 @@ def _supports(run: Run) -> Iterator[str]:
     if scores.ate_m is not None:
         covered = "" if row is None else f", {row.mean**0.5:.1f} times sigma"
         yield f"the position error is {scores.ate_m:.2f} m RMS against {_reference(run)}{covered}"
-    elif not _gnss(run):
+    elif not gnss_innovations(run):
         yield "nothing to check against but the agreement of wheels, gyro and accelerometer"
     gnss = _row(run, "nis gnss")
     if gnss is not None:
@@ -416,10 +361,6 @@ def _row(run: Run, quantity: str) -> Consistency | None:
     return next(rows, None)
 
 
-def _gnss(run: Run) -> list[Innovation]:
-    return [i for i in run.estimate.innovations if i.sensor == "gnss"]
-
-
 def _fix_sigma_m(used: Gnss | None) -> float:
     sigma = np.zeros(0) if used is None else used.sigma_enu_m[:, :2].max(axis=1)
     sigma = sigma[np.isfinite(sigma)]
@@ -435,10 +376,6 @@ def _longest(flags: Sequence[bool]) -> tuple[int, int] | None:
             best = at, end
         at = end
     return best
-
-
-def _since(run: Run, t_ns: int) -> float:
-    return (t_ns - run.recording.start_ns) * 1e-9
 
 
 def _sentence(text: str) -> str:

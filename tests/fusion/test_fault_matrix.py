@@ -10,7 +10,7 @@ import pytest
 
 from tests.studies.fault_matrix import matrix
 from tests.studies.fault_matrix.faults import FAULTS
-from tests.studies.fault_matrix.matrix import TWIN, Cell, clean_log, ended_after, run, tried
+from tests.studies.fault_matrix.matrix import FIELD, TWIN, Cell, clean_log, ended_after, run, tried
 from tests.studies.parts import TaskWorkers
 
 CRASHED = (12, 44)
@@ -37,6 +37,12 @@ def test_what_broke_the_numbers_is_refused(number: int) -> None:
 
 def test_fixes_a_tenth_of_a_second_late_do_not_pass_as_good() -> None:
     assert tried(Cell(562, "steered", "adaptive", True, ("lag",)))["verdict"] == "doubtful"
+
+
+@pytest.mark.parametrize("number", [155, 603, 757])
+def test_what_the_drive_itself_refutes_is_not_good(number: int) -> None:
+    """An IMU whose turn shows late, or never in half a log; an estimate that gave in to fixes."""
+    assert tried(Cell.drawn(number, (*TWIN, *FIELD)))["outcome"] == "warned"
 
 
 def test_a_fault_changes_the_log_alone_that_it_is_given() -> None:

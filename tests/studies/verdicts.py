@@ -17,8 +17,9 @@ import numpy as np
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorOptions
+from terrafusion.fusion.metrics.judged_run import DOUBTFUL, FIVE_SIGMA, GOOD, STRAY_SHARE, UNUSABLE
 from terrafusion.fusion.metrics.scores import Scores, score
-from terrafusion.fusion.metrics.verdict import DOUBTFUL, FAR_M, FIVE_SIGMA, GOOD, STRAY_SHARE, UNUSABLE
+from terrafusion.fusion.metrics.verdict import FAR_M
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

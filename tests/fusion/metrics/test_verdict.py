@@ -10,10 +10,13 @@ import pytest
 
 from terrafusion.datasets.checks import Finding
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
+from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics.baselines import Baselines, OutageBaseline
+from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import Outage, OutageScore, score
-from terrafusion.fusion.metrics.verdict import Run, Verdict, _fix_sigma_m, _longest, judge
+from terrafusion.fusion.metrics.verdict import Verdict, _fix_sigma_m, _longest, judge
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.verdicts import FAULTS, is_wrong, short_drive
 
@@ -21,12 +24,16 @@ RIG = load_vehicle("elevate").rig()
 
 
 def verdict(
-    d, *, truth=True, estimate=None, baselines=None, findings=(), outages=(), held_out=None
-) -> Verdict:
+    d, *, truth=True, estimate=None, baselines=None, findings=(), outages=(), held_out=None,
+    corrections=None,
+) -> Verdict:  # fmt: skip
     estimate = estimate or d.estimate
     recording = d.recording if truth else dataclasses.replace(d.recording, truth=None)
     scores = score(estimate, recording, held_out=held_out, outages=outages)
-    return judge(Run(recording, estimate, scores, baselines or Baselines(), d.fixes, findings, RIG))
+    alone, corrections = baselines or Baselines(), corrections or Corrections()
+    return judge(
+        Run(recording, estimate, scores, alone, d.fixes, findings, RIG, corrections or Corrections())
+    )
 
 
 def with_innovations(d, nis, accepted=True):
@@ -101,7 +108,7 @@ def test_fixes_rejected_in_a_row_are_named_with_time_and_size(drive):
     chi[40:48] = 900.0
     found = verdict(d, truth=False, estimate=with_innovations(d, chi, np.r_[chi[:47] < 900.0, [True] * 53]))
     assert found.value == "doubtful"
-    assert "7 fixes in a row from 40 s on lie 17.0 m off the estimate, which then moved to them" in " ".join(
+    assert "8 fixes in a row from 40 s on lie 17.0 m off the estimate, which then moved to them" in " ".join(
         found.reasons
     )
 
@@ -227,12 +234,74 @@ def test_a_gyro_at_the_end_of_its_range_is_not_good_even_where_nothing_else_show
 )
 def test_a_likely_delay_beyond_the_sigma_of_the_position_is_not_good(drive, delay_s, value):
     d = drive(noise_m=0.01, sigma_m=0.03)
-    recording = dataclasses.replace(d.recording, truth=None)
-    estimate = consistent(d)
-    run = Run(recording, estimate, score(estimate, recording), Baselines(), d.fixes, (), RIG, delay_s)
-    found = judge(run)
+    corrections = Corrections(uncorrected_delay_s=delay_s)
+    found = verdict(d, truth=False, estimate=consistent(d), corrections=corrections)
     assert found.value == value, found
     assert ("the fixes seem 0.30 s" in found.reasons[0].lower()) == (value == "doubtful")
+
+
+def places(d, lever_m=(0.0, 0.0, 0.0), late_s=0.0, from_s=20.0):
+    """An antenna, or a delay, that the drive showed from then on."""
+    found = AntennaPlaces.fixed((0.0, 0.0, 0.0))
+    return found.then(d.recording.start_ns + int(from_s * 1e9), lever_m, round(late_s * 1e9))
+
+
+@pytest.mark.parametrize(
+    ("antenna", "value"),
+    [
+        ({"lever_m": (0.3, 0.0, 0.0)}, "doubtful"),
+        ({"lever_m": (0.1, 0.0, 0.0)}, "good"),
+        ({"lever_m": (0.3, 0.0, 0.0), "from_s": 0.5}, "good"),
+        ({"late_s": 0.5}, "doubtful"),
+        ({"late_s": 0.05}, "good"),
+    ],
+)
+def test_results_before_a_correction_beyond_their_sigma_are_not_good(drive, antenna, value):
+    d = drive(noise_m=0.01, sigma_m=0.03)
+    corrections = Corrections(antenna=places(d, **antenna))
+    found = verdict(d, truth=False, estimate=consistent(d), corrections=corrections)
+    assert found.value == value, found
+    if value == "doubtful":
+        assert found.reasons[0].startswith(
+            "Up to 20 s the results rest on numbers that the drive then refuted"
+        )
+        assert "`terrafusion calibrate LOG --sensors`" in found.reasons[0]
+    assert verdict(d, estimate=consistent(d), corrections=corrections).value == "good", "the truth tells"
+
+
+@pytest.mark.parametrize(("after_s", "value"), [(15.0, "doubtful"), (0.5, "good")])
+def test_what_a_turned_imu_bent_before_its_angle_was_known_is_not_good(drive, after_s, value):
+    d = drive()
+    found = Finding("imu-forward", "error", "imu", "x does not point forward", "90 deg", "turn it")
+    since_ns = d.recording.start_ns + int(after_s * 1e9)
+    corrections = Corrections(frozenset(["imu_yaw_rad"]), since_ns)
+    judged = verdict(d, truth=False, estimate=consistent(d), findings=[found], corrections=corrections)
+    assert judged.value == value
+    assert ("the angle of the IMU" in judged.reasons[0]) == (value == "doubtful")
+    assert "forward" not in " ".join(judged.reasons)
+
+
+@pytest.mark.parametrize(
+    ("sigma_rad", "sigma_m", "value"),
+    [(1.8, 0.02, "doubtful"), (0.7, 0.02, "good"), (None, 0.02, "good"), (1.8, 0.5, "good")],
+)
+def test_an_imu_of_any_angle_is_not_good_where_that_matters(drive, sigma_rad, sigma_m, value):
+    d = drive(noise_m=0.01, sigma_m=sigma_m, turn_radps=0.5)
+    corrections = Corrections(imu_sigma_rad=sigma_rad)
+    found = verdict(d, truth=False, estimate=consistent(d), corrections=corrections)
+    assert found.value == value, found
+    assert ("`imu_yaw_rad`" in found.reasons[0]) == (value == "doubtful")
+    assert verdict(d, estimate=consistent(d), corrections=corrections).value == "good", "the truth tells"
+
+
+@pytest.mark.parametrize(("rejected", "value"), [(4, "doubtful"), (3, "good")])
+def test_a_fix_that_the_estimate_gives_in_to_is_one_of_those_against_it(drive, rejected, value):
+    d = drive()
+    chi = np.random.default_rng(5).chisquare(2, 100)
+    chi[40 : 41 + rejected] = 20.0
+    accepted = np.ones(100, dtype=bool)
+    accepted[40 : 40 + rejected] = False
+    assert verdict(d, truth=False, estimate=with_innovations(d, chi, accepted)).value == value
 
 
 @pytest.mark.parametrize(

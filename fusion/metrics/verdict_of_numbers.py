@@ -1,0 +1,114 @@
+"""Rules of the verdict on numbers: what the log checks found, and what the estimator corrected."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.metrics.judged_run import DOUBTFUL, FIVE_SIGMA, STRAY_SHARE, Reason, Run, since_s
+
+REPORTED = (
+    "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
+    "sigma-too-small", "standing", "saturated",
+)  # fmt: skip
+"""Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
+the estimator estimates itself, such as small scale errors and the receiver's delay, or cost accuracy only. It
+does not estimate delays of IMU and wheels: an offset of their clocks counts, too."""
+LEARNED = {("imu-forward", "imu"): "imu_yaw_rad", ("clock-offset", "gnss"): "gnss_delay_s"}
+"""The number of the robot that settles a finding of the log checks where the estimator corrected it, by code
+and channel."""
+DELAY_SIGMAS = 2.0
+"""A delay of the fixes is likely from so many of its sigmas on (95 %)."""
+
+
+def log_checks(run: Run) -> Iterator[Reason]:
+    """Findings of the log checks that the estimator did not settle itself."""
+    for finding in run.findings:
+        if LEARNED.get((finding.code, finding.channel)) in run.corrections.numbers:
+            continue
+        clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
+        if finding.severity == "error" or finding.code in REPORTED or clock:
+            yield (
+                DOUBTFUL,
+                f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}",
+            )
+
+
+def delayed(run: Run) -> Iterator[Reason]:
+    """Late fixes that were not corrected, and which sigma does not cover."""
+    late, (speed_mps, variance_m2) = run.corrections.uncorrected_delay_s, _motion(run)
+    if late is None or not len(speed_mps):
+        return
+    delay_s, sigma_s = late
+    shift_m = abs(delay_s) * speed_mps
+    beyond = shift_m**2 > FIVE_SIGMA * variance_m2
+    if abs(delay_s) > DELAY_SIGMAS * sigma_s and beyond.mean() > STRAY_SHARE:
+        yield (
+            DOUBTFUL,
+            f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
+            f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, which sigma does not "
+            "include; give the receiver's delay in the vehicle file, or drive longer",
+        )
+
+
+def refuted(run: Run) -> Iterator[Reason]:
+    """Results with numbers that the drive refuted later: their sigma does not include the difference.
+
+    The angle of an IMU bends all that came before it was known; another antenna or delay shifts a result by
+    a known distance. With truth, the errors themselves are tested instead.
+    """
+    t_ns, (speed_mps, variance_m2) = run.estimate.trajectory.t_ns[1:], _motion(run)
+    if run.scores.against == "truth" or not len(speed_mps):
+        return
+    wrong, names = np.zeros(len(t_ns), dtype=bool), []
+    if run.corrections.imu_since_ns is not None:
+        wrong |= t_ns < run.corrections.imu_since_ns
+        names += ["the angle of the IMU"] if wrong.any() else []
+    if run.corrections.antenna is not None:
+        shift_m, shift_s = run.corrections.antenna.later_shift(t_ns)
+        shifts_m = {"the antenna's place": shift_m, "the delay of the fixes": shift_s * speed_mps}
+        for name, off_m in shifts_m.items():
+            beyond = off_m**2 > FIVE_SIGMA * variance_m2
+            wrong |= beyond
+            names += [name] if beyond.any() else []
+    if wrong.mean() > STRAY_SHARE:
+        until_s = since_s(run, int(t_ns[wrong][-1]))
+        yield (
+            DOUBTFUL,
+            f"up to {until_s:.0f} s the results rest on numbers that the drive then refuted "
+            f"({', '.join(names)}), and sigma does not include that; write what it showed to a vehicle file "
+            "(`terrafusion calibrate LOG --sensors`) and replay the log with it",
+        )
+
+
+def unconfirmed_imu(run: Run) -> Iterator[Reason]:
+    """An IMU that may be turned by a quarter for all that vehicle file and drive tell, where that matters.
+
+    It would measure a change of velocity to the side: within a second, half of it times a second and the
+    chord of a quarter turn.
+    """
+    sigma_rad, (_, variance_m2) = run.corrections.imu_sigma_rad, _motion(run)
+    known = sigma_rad is None or 2.0 * sigma_rad < 0.5 * np.pi
+    if known or run.scores.against == "truth" or not len(variance_m2):
+        return
+    t_ns, velocity_mps = run.estimate.trajectory.t_ns, run.estimate.velocity_mps[:, :2]
+    later = np.minimum(np.searchsorted(t_ns, t_ns[1:] + 1_000_000_000), len(t_ns) - 1)
+    off_m = np.linalg.norm(velocity_mps[later] - velocity_mps[1:], axis=1) / np.sqrt(2.0)
+    beyond = off_m**2 > FIVE_SIGMA * variance_m2
+    if beyond.mean() > STRAY_SHARE:
+        yield (
+            DOUBTFUL,
+            "neither vehicle file nor drive show how the IMU is turned about its vertical axis: a quarter "
+            f"turn would move results by up to {off_m[beyond].max():.1f} m, beyond their sigma; give "
+            "`imu_yaw_rad` in the vehicle file, or drive longer, with changes of speed and turns",
+        )
+
+
+def _motion(run: Run) -> tuple[Array, Array]:
+    """Speeds (N - 1,) m/s between keyframes, and variances m2 of the next positions; empty if unknown."""
+    path = run.estimate.trajectory
+    if path.covariance is None or len(path) < 2:
+        return np.zeros(0), np.zeros(0)
+    step_m = np.linalg.norm(np.diff(path.position_m[:, :2], axis=0), axis=1)
+    variance_m2 = path.covariance[1:, :2, :2].trace(axis1=1, axis2=2) / 2.0
+    return step_m / (np.diff(path.t_ns) * 1e-9), variance_m2
