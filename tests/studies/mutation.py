@@ -48,6 +48,7 @@ TARGETS = {
     "fusion/metrics/error_series.py": ("tests/fusion/metrics/test_scores.py",),
     "fusion/metrics/scores.py": ("tests/fusion/metrics/test_scores.py",),
     "fusion/metrics/verdict.py": ("tests/fusion/metrics/test_verdict.py",),
+    "fusion/metrics/verdict_of_numbers.py": ("tests/fusion/metrics/test_verdict.py",),
     "fusion/weighting/weighting.py": WEIGHTS,
     "fusion/weighting/innovation.py": WEIGHTS,
     "fusion/weighting/robust.py": WEIGHTS,

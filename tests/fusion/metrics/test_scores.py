@@ -419,6 +419,18 @@ def test_a_start_is_aligned_by_its_heading_or_by_least_squares(heading):
     assert how == (said if heading else "a least-squares fit over the first 3.0 m")
 
 
+@pytest.mark.parametrize(("step_m", "turned"), [(0.45, True), (0.3, False)])
+def test_a_path_of_less_than_a_metre_has_no_direction(step_m, turned):
+    errors = straight(heading=False)
+    north_east = errors.reference_m[:, :1] * np.sqrt([0.5, 0.5])
+    short = dataclasses.replace(
+        errors, estimate_m=step_m * errors.estimate_m, reference_m=step_m * north_east
+    )
+    moved, _ = align_start(short)
+    yaw = moved.estimate_yaw_rad - errors.estimate_yaw_rad
+    assert yaw == pytest.approx(np.full(5, -np.pi / 4.0 if turned else 0.0), abs=1e-9)
+
+
 def test_a_heading_that_drifts_after_the_first_metre_turns_nothing():
     errors = straight(heading=True)
     yaw = errors.estimate_yaw_rad + 0.5 * (np.arange(5) > 2)  # more than a metre on

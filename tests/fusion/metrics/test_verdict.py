@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import Finding
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.corrections import Corrections
@@ -171,6 +172,21 @@ def test_nothing_to_check_against_is_doubtful_without_sensors_that_vouch(drive):
     )
     assert judge(run).value == "doubtful"
     assert "nothing to check the path against" in judge(run).reasons[0].lower()
+
+
+@pytest.mark.parametrize(("share", "value"), [(None, "good"), (0.05, "good"), (0.15, "doubtful")])
+def test_wheels_that_slip_cannot_vouch(drive, share, value):
+    d = drive(sigma_m=1.0)
+    t_ns = d.recording.wheels.t_ns
+    imu = Imu(t_ns, np.zeros((len(t_ns), 3)), np.tile([0.0, 0.0, 9.81], (len(t_ns), 1)))
+    log = dataclasses.replace(d.recording, truth=None, imu=imu)
+    agreeing = Innovation(int(d.fixes.t_ns[0]), "wheels", np.zeros(1), 0.5, 1, True)
+    n = len(d.estimate.status)
+    slipping = None if share is None else np.arange(n) < share * n
+    estimate = dataclasses.replace(d.estimate, innovations=(agreeing,), slipping=slipping)
+    found = judge(Run(log, estimate, score(estimate, Recording("r", 0)), Baselines(), None, (), RIG))
+    assert found.value == value, found
+    assert ("the wheels slipped 15 % of the time" in found.reasons[0]) == (value == "doubtful")
 
 
 def test_findings_of_the_log_checks_count_by_their_kind(drive):

@@ -12,6 +12,7 @@ from terrafusion.twin.gap.infer.other_drives import (
     JITTER,
     MISFIT_SCATTER,
     NUISANCE_SCATTER,
+    PRIOR_COLUMNS,
     UNKNOWN_SIZES,
     WIDE,
     _deviations,
@@ -20,6 +21,7 @@ from terrafusion.twin.gap.infer.other_drives import (
     learn_offsets,
 )
 from terrafusion.twin.gap.null.score import Score
+from terrafusion.twin.gap.rollout.nuisance import BASIS
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])
 P = len(CANDIDATES.keys) + 4
@@ -71,6 +73,25 @@ def test_without_a_gap_p_values_are_uniform(drive: str, judged: int) -> None:
 def test_an_effect_is_seen_on_either_drive(drive: str) -> None:
     found = [p_value(i, drive, effect=3.0) for i in range(20)]
     assert sum(p <= 0.05 for p in found) >= 17
+
+
+def test_the_prior_of_an_offset_is_learned_of_effects_together_and_of_each_channel() -> None:
+    effects, channels = len(CANDIDATES.keys), 2
+    sizes = np.repeat([6.0, 4.0, 0.1], [effects, len(BASIS), len(BASIS)])
+    rng = np.random.default_rng(3)
+    J = rng.standard_normal((ROWS, len(sizes)))
+    references = []
+    for _ in range(6):
+        error = rng.standard_normal(ROWS) + J @ sizes
+        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+    offsets = learn_offsets(references, effects)
+    own, begin = offsets.mean**2 + np.diag(offsets.covariance), 0
+    for size in (effects, *[len(BASIS)] * channels):
+        mine = slice(begin, begin + size)
+        learned = (PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + size)
+        np.testing.assert_allclose(offsets.prior[mine], max(learned, 1.0), rtol=1e-9)
+        begin += size
+    assert offsets.prior[0] > offsets.prior[effects] > offsets.prior[-1] == 1.0
 
 
 def test_what_references_do_not_show_counts_as_unknown() -> None:
