@@ -27,13 +27,14 @@ def blocks(document: Path) -> Iterator[tuple[int, str, str]]:
         yield text[: match.start()].count("\n") + 2, match[1], match[2]
 
 
-def run_command(line: str) -> None:
+def run_command(line: str) -> str:
     name, *arguments = shlex.split(line)
     assert name == "terrafusion", line
     if " ".join(arguments[:2]) in SLOW:
         arguments.append("--help")
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, f"{line}\n{result.output}"
+    return result.output
 
 
 def run_python(document: Path, line: int, code: str, session: dict[str, Any]) -> None:
@@ -79,6 +80,14 @@ def test_tutorial(folder: Path) -> None:
     assert (folder / "adaptive" / "weights.jsonl").stat().st_size > 1_000
     assert (folder / "own-results" / "metrics.json").is_file()
     assert abs(session["state"].slip) < 1.0
+
+
+def test_a_gap_is_found_and_closed(folder: Path) -> None:
+    """The commands of the tutorial end as it says."""
+    document = ROOT / "docs" / "tutorials" / "close-a-gap.md"
+    printed = [run_command(line) for _, _, text in blocks(document) for line in text.splitlines()]
+    assert [text.startswith("Gap caused by wheel_radius (") for text in printed[-2:]] == [True, False]
+    assert printed[-1].startswith("No gap: ")
 
 
 @pytest.mark.parametrize(
