@@ -27,14 +27,14 @@ def allan(subjects: SubjectsArgument = None) -> Result:
 
     terrafusion allan parked.mcap
     """
-    from terrafusion.twin.analysis.allan import recording_lines, vehicle_lines
+    from terrafusion.twin.analysis.allan import recording_at_rest, vehicle_at_rest
     from terrafusion.twin.model.vehicle import vehicle_names
 
-    lines: list[str] = []
+    found = []
     for subject in subjects or ["elevate"]:
         if subject in vehicle_names() or subject.endswith((".yaml", ".yml")):
-            lines += vehicle_lines(subject)
+            found.append(vehicle_at_rest(subject))
             continue
-        for recording in HowRead().open_all([subject], None):
-            lines += recording_lines(recording)
-    return Result(lines)
+        found += map(recording_at_rest, HowRead().open_all([subject], None))
+    lines = [line for one in found for line in one.lines()]
+    return Result(lines, document=[one.to_json() for one in found])

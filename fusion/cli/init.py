@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
     from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import FirstVehicle
+    from terrafusion.fusion.metrics.verdict import Verdict
 
 
 def init(
@@ -65,7 +66,13 @@ def init(
         no_verdict: Write the file only; do not replay the log with it.
     """
     from terrafusion.datasets.readers.ros.streams import decoded_once
-    from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
+    from terrafusion.fusion.cli.init_page import (
+        ask,
+        choose_sensors,
+        contents_lines,
+        document_of,
+        result_lines,
+    )
     from terrafusion.fusion.cli.inspect_page import print_lines
     from terrafusion.fusion.init.vehicle import first_vehicle, generic_rig
 
@@ -91,9 +98,13 @@ def init(
             found = first_vehicle(first_log.read, first, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
-    lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]
+    verdict = None if no_verdict else _verdict(found, out)
+    lines = ["", *([] if verdict is None else [*verdict.lines(), ""])]
     first_step, command = _next_commands(log, out, first_log.options(), bool(found.repaired))
-    return Result([*lines, *first_step], command, short=f"written to {out}")
+    document = document_of(found, out, verdict) | {
+        "next": [line.partition(": ")[2] for line in (*first_step, command)]
+    }
+    return Result([*lines, *first_step], command, document, short=f"written to {out}")
 
 
 def _answers(out: Path, vehicle_name: str | None, **texts: str | None) -> Answers:
@@ -170,11 +181,11 @@ def _write(out: Path, log: str, found: FirstVehicle) -> None:
     write_draft(out, found.draft, about)
 
 
-def _verdict(found: FirstVehicle, out: Path) -> list[str]:
+def _verdict(found: FirstVehicle, out: Path) -> Verdict:
     """The verdict on a replay of the log with the file."""
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.replay import replay
 
     with progress_bar("replaying") as progress, errors_of(found.recording.name):
         result = replay(found.recording, vehicle=out, findings=found.findings, progress=progress)
-    return result.verdict.lines()
+    return result.verdict

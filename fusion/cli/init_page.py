@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.draft import DraftLine
     from terrafusion.fusion.init.vehicle import FirstVehicle
+    from terrafusion.fusion.metrics.verdict import Verdict
 
 QUESTIONS = {
     "drive": "how it turns: differential, skid_steer, tracked, ackermann or four_wheel_steer",
@@ -150,3 +151,17 @@ def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
         yield "", line
     yield "", ""
     yield "", f"written to {out}"
+
+
+def document_of(found: FirstVehicle, out: Path, verdict: Verdict | None) -> dict[str, Any]:
+    """What `--json` prints: the file's section `robot`, what of it is assumed, findings and the verdict."""
+    from terrafusion.datasets.core.json_text import finite
+
+    return {
+        "file": str(out),
+        "robot": finite({name: line.raw() for name, line in found.draft.items()}),
+        "assumed": [name for name, line in found.draft.items() if line.assumed],
+        "repaired": [one.to_dict() for one in found.repaired],
+        "findings": [one.to_dict() for one in found.findings],
+        "verdict": None if verdict is None else {"value": verdict.value, "reasons": [*verdict.reasons]},
+    }

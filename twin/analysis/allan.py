@@ -1,14 +1,16 @@
 """Overlapping Allan deviation of an IMU and its noise parameters (IEEE Std 952-1997, annex C)."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
@@ -17,6 +19,7 @@ CONFIDENCE = 0.95
 REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
+ABSENT = "not in the log, or with gaps"
 LEAST_S = 10.0 * LONG_S
 """Shorter series have too few long clusters for the bias parameters."""
 
@@ -124,8 +127,35 @@ def expected_deviation(tau_s: Array, density: float, walk: float, floor: float) 
     return np.sqrt(density**2 / tau_s + walk**2 * tau_s / 3.0 + floor**2)
 
 
-def vehicle_lines(vehicle: str, hours: float = 2.0, seeds: int = 4) -> list[str]:
-    """A table of the Allan deviation of a vehicle's simulated IMU at rest, beside the parameters of its file.
+@dataclass(frozen=True, eq=False)
+class ImuAtRest:
+    """Curves of gyro and accelerometer by name (none: `ABSENT`), and what was specified."""
+
+    title: str
+    curves: Mapping[str, list[Allan]]
+    specified: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """Title and tables as text."""
+        lines = [self.title]
+        for name, own in self.curves.items():
+            lines += _table(name, own, self.specified.get(name)) if own else [f"{name}: {ABSENT}"]
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as numbers; the parameters in units of the channel, their errors one sigma."""
+        found: dict[str, Any] = {"title": self.title}
+        for name, own in self.curves.items():
+            found[name] = None
+            if own:
+                curve = {"tau_s": own[0].tau_s.tolist(), "deviation": _mean(own).tolist()}
+                noise = finite(asdict(inertial_noise(own)))
+                found[name] = curve | noise | {"specified": self.specified.get(name)}
+        return found
+
+
+def vehicle_at_rest(vehicle: str, hours: float = 2.0, seeds: int = 4) -> ImuAtRest:
+    """A vehicle's simulated IMU at rest, beside the parameters of its file.
 
     Raises:
         ConfigError: unknown vehicle.
@@ -145,14 +175,12 @@ def vehicle_lines(vehicle: str, hours: float = 2.0, seeds: int = 4) -> list[str]
     for seed in range(seeds):
         for name, values in zip(curves, at_rest(params, count, seed), strict=True):
             curves[name] += [allan_deviation(column, spec.rate_hz, 1) for column in values.T]
-    lines = [f"{vehicle}: IMU at rest, {hours:g} h, {seeds} seeds x 3 axes, mean of the curves"]
-    for name, own in curves.items():
-        lines += _table(name, own, specified[name])
-    return lines
+    title = f"{vehicle}: IMU at rest, {hours:g} h, {seeds} seeds x 3 axes, mean of the curves"
+    return ImuAtRest(title, curves, specified)
 
 
-def recording_lines(recording: Recording) -> list[str]:
-    """A table of the Allan deviation of a recorded IMU, which should be at rest.
+def recording_at_rest(recording: Recording) -> ImuAtRest:
+    """A recorded IMU, which should be at rest.
 
     Raises:
         DataError: no IMU, or too short a log.
@@ -165,21 +193,25 @@ def recording_lines(recording: Recording) -> list[str]:
             channel="imu", remedy=f"give a log of {LEAST_S:g} s or more with the robot at rest",
         )  # fmt: skip
     rate_hz = (len(imu) - 1) / seconds
-    lines = [f"{recording.name}: IMU, {seconds:.0f} s at {rate_hz:.1f} Hz, mean of the axes"]
+    curves = {}
     for name, values in (("gyro", imu.gyro_radps), ("accel", imu.accel_mps2)):
         axes = [column[np.isfinite(column)] for column in values.T]
-        curves = [allan_deviation(column, rate_hz, 1) for column in axes if len(column) == len(imu)]
-        lines += _table(name, curves, None) if curves else [f"{name}: not in the log, or with gaps"]
-    return lines
+        curves[name] = [allan_deviation(column, rate_hz, 1) for column in axes if len(column) == len(imu)]
+    title = f"{recording.name}: IMU, {seconds:.0f} s at {rate_hz:.1f} Hz, mean of the axes"
+    return ImuAtRest(title, curves)
+
+
+def _mean(curves: list[Allan]) -> Array:
+    """The curves as one: root of the mean square."""
+    return np.asarray(np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=0)))
 
 
 def _table(name: str, curves: list[Allan], specified: Sequence[float] | None) -> list[str]:
     """Deviation by cluster time and the parameters read from it, beside those specified where given."""
     tau_s = curves[0].tau_s
-    mean = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=0))
     lines = [f"{name}: tau s, Allan deviation" + (", expected" if specified else "")]
     theory = expected_deviation(tau_s, *specified) if specified else None
-    for k, (tau, value) in enumerate(zip(tau_s, mean, strict=True)):
+    for k, (tau, value) in enumerate(zip(tau_s, _mean(curves), strict=True)):
         lines.append(f"  {tau:9.2f}  {value:.3e}" + ("" if theory is None else f"  {theory[k]:.3e}"))
     fit = inertial_noise(curves)
     estimates = zip(

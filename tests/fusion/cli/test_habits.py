@@ -107,6 +107,7 @@ def test_verbose_tells_the_options_and_where_an_error_arose(here: Path, terrafus
     [
         ("replay LOG --out out", "verdict"),
         ("inspect LOG", "channels"),
+        ("init LOG --out robot.yaml", "verdict"),
         ("convert LOG out", "samples"),
         ("convert LOG out.mcap --apply-fixes", "findings"),
         ("simulate short.yaml --out out", "summary"),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
-from terrafusion.twin.analysis.allan import allan_deviation, expected_deviation, inertial_noise
+from terrafusion.twin.analysis.allan import ImuAtRest, allan_deviation, expected_deviation, inertial_noise
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
 from terrafusion.twin.sensors.noise import NoiseStreams, flicker, white_and_walk
@@ -90,3 +92,14 @@ def test_the_simulated_imu_has_the_noise_of_its_data_sheet() -> None:
 def test_too_short_a_series_is_refused() -> None:
     with pytest.raises(ValueError, match="9 values are too few"):
         allan_deviation(np.zeros(9), RATE_HZ)
+
+
+def test_text_and_json_tell_the_same_numbers() -> None:
+    curve = allan_deviation(white(20_000, 1)[:, 0], RATE_HZ)
+    rest = ImuAtRest("a log", {"gyro": [curve], "accel": []}, {"gyro": (1e-3, 0.0, 0.0)})
+    found = json.loads(json.dumps(rest.to_json(), allow_nan=False))
+    assert found["accel"] is None
+    assert "accel: not in the log, or with gaps" in rest.lines()
+    assert found["gyro"]["deviation"] == pytest.approx(curve.deviation)
+    assert found["gyro"]["specified"] == [1e-3, 0.0, 0.0]
+    assert f"estimated {found['gyro']['density']:.3e}" in "\n".join(rest.lines())
