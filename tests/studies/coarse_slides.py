@@ -10,6 +10,7 @@ inside their 95 % ellipses; last the ratio of errors with a 95 % interval (boots
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -19,6 +20,7 @@ from terrafusion.fusion.estimator.drift_watch import DriftWatch
 from tests.studies.opponents import ours
 from tests.studies.opponents.drives import Drive, drives_of, longest, vehicle_of
 from tests.studies.opponents.protocol import streams_of
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 DEVELOPED = (
     "norlab_drive/gravel_2024_8_6_11h37s32/windows", "norlab_drive/ice_2024_7_30_16h30s21/windows",
@@ -42,24 +44,34 @@ def rows_of(drive: Drive, seconds: float, watched: bool) -> tuple[int, float, fl
     return len(rows), float(np.mean([r.error_m for r in rows])), float(np.mean(inside)) if inside else np.nan
 
 
+def compared(name: str) -> list[tuple[float, int, float, float, float, float]]:
+    """Of one log: seconds, outages, error without and with the watch, shares inside likewise."""
+    found = []
+    for drive in longest(drives_of(f"{name}@consumer"), 1):
+        for seconds in SECONDS:
+            n, before_m, held = rows_of(drive, seconds, watched=False)
+            if n:
+                _, after_m, holds = rows_of(drive, seconds, watched=True)
+                found.append((seconds, n, before_m, after_m, held, holds))
+    return found
+
+
 def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.coarse_slides")
     norlab = [name for name in catalogued() if name.startswith("norlab_drive/")]
     parser.add_argument("logs", nargs="*", default=[*DEVELOPED, *(n for n in norlab if n not in DEVELOPED)])
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
+    given = parser.parse_args()
     print(f"{'log':>48} {'s':>3} {'n':>3} {'error':>7} {'watched':>7} {'inside':>7} {'watched':>7}")
     logs: dict[str, list[float]] = {}
-    for name in parser.parse_args().logs:
-        for drive in longest(drives_of(f"{name}@consumer"), 1):
-            for seconds in SECONDS:
-                n, before_m, held = rows_of(drive, seconds, watched=False)
-                if not n:
-                    continue
-                _, after_m, holds = rows_of(drive, seconds, watched=True)
-                figures = " ".join(f"{x:7.2f}" for x in (before_m, after_m, held, holds))
-                print(f"{name:>48} {seconds:3.0f} {n:3d} {figures}", flush=True)
-                part = "developed" if name in DEVELOPED else "judged"
-                logs.setdefault(f"{part} {name}", []).append(np.log(after_m / before_m))
+    found = answers(given.logs, compared, TaskWorkers.of(given), given.out)
+    for name, rows in zip(given.logs, found, strict=True):
+        for seconds, n, *figures in rows:
+            print(f"{name:>48} {seconds:3.0f} {n:3d} {' '.join(f'{x:7.2f}' for x in figures)}")
+            part = "developed" if name in DEVELOPED else "judged"
+            logs.setdefault(f"{part} {name}", []).append(np.log(figures[1] / figures[0]))
     rng = np.random.default_rng(0)
     for part in ("developed", "judged"):
         x = np.array([np.mean(v) for name, v in logs.items() if name.startswith(part)])
@@ -72,4 +84,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    from tests.studies import coarse_slides
+
+    raise SystemExit(coarse_slides.main())  # workers know the logs by the module's own name

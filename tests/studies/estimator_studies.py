@@ -117,12 +117,13 @@ ESTIMATOR = (
     Study(
         "coarse_slides",
         "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
-        module("coarse_slides"),
+        module("coarse_slides", "--out", OUT),
         5,
         {
             "judged": r"judged: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
             "developed": r"developed: .* logs: ([\d.]+ \[[\d.]+, [\d.]+\])",
         },
+        spread=True,
     ),
     Study(
         "outage_terms",
@@ -133,7 +134,7 @@ ESTIMATOR = (
     Study(
         "grounds",
         "What does adaptive mode gain in outages on logs of one robot, and does memory know its grounds?",
-        module("grounds"),
+        module("grounds", "--out", OUT),
         8,
         {
             f"{group}_adaptive": rf"{group}, adaptive over fixed: ([\d.]+) "
@@ -144,6 +145,7 @@ ESTIMATOR = (
             f"memory_{ground}_right": rf"memory on {ground}: right (\d+ %)"
             for ground in ("asphalt", "grass", "gravel", "ice", "loose_sand")
         },
+        spread=True,
     ),
     Study(
         "ground_changes",

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 Segments = tuple[tuple[float, float, float], ...]
 
@@ -41,19 +44,6 @@ EFFECTS = {
 SPREAD = 0.05
 """1 sigma of the ground's strength from run to run, of the typical size of its parameters."""
 GROUND = ("soil_strength/shear", "soil_strength/bearing")
-
-
-@dataclass
-class Counts:
-    """Answers by what was wanted."""
-
-    alarms: int = 0
-    clean: int = 0
-    detected: int = 0
-    named: int = 0
-    effects: int = 0
-    covered: list[float] = dataclasses.field(default_factory=list)
-    seconds: list[float] = dataclasses.field(default_factory=list)
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
@@ -80,41 +70,51 @@ def drive(
     return dataclasses.replace(made, name=f"{robot} {name} {seed}", truth=None, truth_channels=())
 
 
-def judge(
-    counts: Counts, robot: str, pair: tuple[str, str], soil: str, number: int, given: argparse.Namespace
-) -> None:
-    """Add the answers for one robot, soil and pair of drives."""
-    vehicle, first = load_vehicle(robot), 1000 * (number + 1)
-    references = [drive(pair[0], robot, soil, first + i) for i in range(given.references)]
-    cache: dict = {}
-    trials = [""] * given.clean
+@functools.lru_cache(maxsize=1)
+def references_of(
+    robot: str, name: str, soil: str, first: int, count: int
+) -> tuple[list[Recording], dict[str, Any]]:  # fmt: skip
+    """References of a robot, and what has been computed of them in this process."""
+    return [drive(name, robot, soil, first + i) for i in range(count)], {}
+
+
+def judged(trial: tuple[str, str, tuple[str, str], int, int, str, int, int]) -> dict[str, Any]:
+    """The answer to one trial.
+
+    Args:
+        trial: robot, soil, pair of drives and its number; number, effect ("" for none), references and runs.
+    """
+    robot, soil, pair, number, index, key, count, runs = trial
+    first = 1000 * (number + 1)
+    references, cache = references_of(robot, pair[0], soil, first, count)
+    size = {key: EFFECTS[key]} if key else None
+    given = [drive(pair[1], robot, soil, first + 100 + 10 * index + k, size) for k in range(runs)]
+    began = time.process_time()
+    answer = diagnose(given, references, load_vehicle(robot), soil, cache=cache).to_json()
+    return {
+        "seconds": time.process_time() - began,
+        "detected": answer["gap"]["detected"],
+        "class": sorted({e for c in answer["causes"] if c["effect"] in answer["named"] for e in c["class"]}),
+        "verdict": answer["verdict"],
+        "named": answer["named"],
+        "covered": answer["drives"]["covered"] if answer.get("drives") else None,
+    }
+
+
+def trials(given: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """All trials, robot by robot and pair by pair: clean ones, then effects in turn."""
+    out: list[tuple[Any, ...]] = []
+    places = [(*where, pair) for where in ROBOTS[: given.robots] for pair in PAIRS[: given.pairs]]
     keys = list(EFFECTS)
-    trials += [keys[(number * given.effects + i) % len(keys)] for i in range(given.effects)]
-    for i, key in enumerate(trials):
-        size = {key: EFFECTS[key]} if key else None
-        runs = [drive(pair[1], robot, soil, first + 100 + 10 * i + k, size) for k in range(given.runs)]
-        began = time.process_time()
-        answer = diagnose(runs, references, vehicle, soil, cache=cache).to_json()
-        counts.seconds.append(time.process_time() - began)
-        found = answer["gap"]["detected"]
-        sets = {e for c in answer["causes"] if c["effect"] in answer["named"] for e in c["class"]}
-        if key:
-            counts.effects += 1
-            counts.detected += found
-            counts.named += key.split("/")[0] in sets
-        else:
-            counts.clean += 1
-            counts.alarms += found
-        if answer.get("drives"):
-            counts.covered.append(answer["drives"]["covered"])
-        print(
-            f"{robot:8s} {pair[0]} -> {pair[1]:17s} {key or 'none':30s} {answer['verdict']:10s}",
-            *answer["named"],
-            flush=True,
-        )
+    for number, (robot, soil, pair) in enumerate(places):
+        changes = [""] * given.clean
+        changes += [keys[(number * given.effects + i) % len(keys)] for i in range(given.effects)]
+        for index, key in enumerate(changes):
+            out.append((robot, soil, pair, number, index, key, given.references, given.runs))
+    return out
 
 
-def main(arguments: list[str] | None = None) -> Counts:
+def main() -> int:
     """Print a line a diagnosis, then counts with intervals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robots", type=int, default=3)
@@ -123,24 +123,31 @@ def main(arguments: list[str] | None = None) -> Counts:
     parser.add_argument("--clean", type=int, default=2, help="clean trials a pair of drives and robot")
     parser.add_argument("--effects", type=int, default=1, help="trials with an effect, likewise")
     parser.add_argument("--pairs", type=int, default=3)
-    given = parser.parse_args(arguments)
-    counts, number = Counts(), 0
-    for robot, soil in ROBOTS[: given.robots]:
-        for pair in PAIRS[: given.pairs]:
-            judge(counts, robot, pair, soil, number, given)
-            number += 1
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
+    given = parser.parse_args()
+    wanted = trials(given)
+    found = answers(wanted, judged, TaskWorkers.of(given), given.out)
+    for (robot, _, pair, _, _, key, *_), one in zip(wanted, found, strict=True):
+        what = f"{robot:8s} {pair[0]} -> {pair[1]:17s} {key or 'none':30s}"
+        print(f"{what} {one['verdict']:10s}", *one["named"])
+    clean = [one for trial, one in zip(wanted, found, strict=True) if not trial[5]]
+    changed = [(trial[5].split("/")[0], one) for trial, one in zip(wanted, found, strict=True) if trial[5]]
     for name, hits, of in (
-        ("false alarms", counts.alarms, counts.clean),
-        ("detected", counts.detected, counts.effects),
-        ("right effect in a named class", counts.named, counts.effects),
+        ("false alarms", sum(one["detected"] for one in clean), len(clean)),
+        ("detected", sum(one["detected"] for _, one in changed), len(changed)),
+        ("right effect in a named class", sum(key in one["class"] for key, one in changed), len(changed)),
     ):
         low, high = wilson(hits, of)
         print(f"{name} {hits} of {of} ({low:.2f} to {high:.2f})")
-    print(f"CPU time a diagnosis, median {np.median(counts.seconds):.1f} s")
-    if counts.covered:
-        print(f"drives covered, median {np.median(counts.covered):.2f}")
-    return counts
+    print(f"CPU time a diagnosis, median {np.median([one['seconds'] for one in found]):.1f} s")
+    covered = [one["covered"] for one in found if one["covered"] is not None]
+    if covered:
+        print(f"drives covered, median {np.median(covered):.2f}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import gap_other_drives
+
+    raise SystemExit(gap_other_drives.main())  # workers know the trials by the module's own name

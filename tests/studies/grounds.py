@@ -28,6 +28,7 @@ from terrafusion.fusion.metrics.health import rolled_until_m
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.choose import choose_vehicle
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 SPLIT = Path(__file__).with_name("ground_split.yaml")
 SLIPPING, FIRM = ("ice", "loose_sand", "gravel", "grass"), ("asphalt",)
@@ -47,11 +48,13 @@ class Row:
     errors_m: dict[str, float]
 
 
-def runs_of(robot: str, part: str) -> Iterator[tuple[str, str, Recording]]:
-    """Ground, name and recording of the runs of a robot to "learn" from or to "judge"."""
+def runs_of(robot: str, part: str, only: str = "") -> Iterator[tuple[str, str, Recording]]:
+    """Ground, name and recording of the runs of a robot to "learn" from or "judge", or of one log alone."""
     for ground, names in read_yaml(SPLIT)[robot][part].items():
         for name in names:
             log, _, number = str(name).partition("#")
+            if only and only.partition("#")[0] != log:
+                continue
             for k, run in enumerate(read_runs(log)[0]):
                 if not number or int(number) == k:
                     yield str(ground), f"{log}#{k}", aided_by_truth(run, 1)
@@ -92,9 +95,9 @@ def knowledge(robot: str) -> None:
         for ground, keyframes in seen.items():
             answer = "new" if ground not in label_of else "right" if label_of[ground] == label else "wrong"
             found.setdefault(label, Counter())[answer] += keyframes
-    for label, answers in found.items():
+    for label, counts in found.items():
         shares = ", ".join(
-            f"{a} {100.0 * answers[a] / answers.total():.0f} %" for a in ("right", "wrong", "new")
+            f"{a} {100.0 * counts[a] / counts.total():.0f} %" for a in ("right", "wrong", "new")
         )
         print(f"memory on {label}: {shares}")
 
@@ -116,18 +119,31 @@ def passes(run: Recording) -> list[list[Outage]]:
     return [outages for outages in out if outages]
 
 
-def judged(robot: str) -> Iterator[Row]:
+def errors_of(run: tuple[str, str]) -> list[tuple[float, dict[str, float]]]:
+    """Start and errors by mode of every outage of a run: robot and name of the run."""
+    robot, name = run
+    recording = next(one for _, called, one in runs_of(robot, "judge", name) if called == name)
+    found = []
+    for outages in passes(recording):
+        errors: dict[float, dict[str, float]] = {}
+        for mode in MODES:
+            result = replay(recording, mode=mode, outages=outages)
+            for outage, held_out in zip(outages, result.scores.outages, strict=True):
+                if held_out.end_error_m is not None:
+                    errors.setdefault(outage.start_s, {})[mode] = held_out.end_error_m
+        found += list(errors.items())
+    return found
+
+
+def judged(robot: str, workers: TaskWorkers, out: Path | None) -> list[Row]:
     """Rows of all judge runs of a robot."""
-    for ground, name, run in runs_of(robot, "judge"):
-        for outages in passes(run):
-            errors: dict[float, dict[str, float]] = {}
-            for mode in MODES:
-                result = replay(run, mode=mode, outages=outages)
-                for outage, found in zip(outages, result.scores.outages, strict=True):
-                    if found.end_error_m is not None:
-                        errors.setdefault(outage.start_s, {})[mode] = found.end_error_m
-            yield from (Row(ground, name, start, found) for start, found in errors.items())
-        print(f"judged {name}", flush=True)
+    runs = [(ground, name) for ground, name, _ in runs_of(robot, "judge")]
+    found = answers([(robot, name) for _, name in runs], errors_of, workers, out)
+    return [
+        Row(ground, name, start_s, errors)
+        for (ground, name), rows in zip(runs, found, strict=True)
+        for start_s, errors in rows
+    ]
 
 
 def ratio(rows: list[Row], grounds: tuple[str, ...]) -> tuple[float, float, float]:
@@ -168,11 +184,15 @@ def main() -> int:
     """Judge, ask the memory, print."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.grounds", description=__doc__)
     parser.add_argument("--robot", default="warthog", help="a robot of ground_split.yaml")
-    robot = parser.parse_args().robot
-    report(list(judged(robot)))
-    knowledge(robot)
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
+    given = parser.parse_args()
+    report(judged(given.robot, TaskWorkers.of(given), given.out))
+    knowledge(given.robot)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    from tests.studies import grounds
+
+    raise SystemExit(grounds.main())  # workers know the runs by the module's own name

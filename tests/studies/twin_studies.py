@@ -26,13 +26,14 @@ TWIN = (
     Study(
         "gap_other_drives",
         "Does the diagnosis hold on drives that its references did not make?",
-        module("gap_other_drives"),
+        module("gap_other_drives", "--out", OUT),
         6,
         {
             "alarms": r"false alarms (\d+ of \d+)",
             "detected": r"detected (\d+ of \d+)",
             "named": r"right effect in a named class (\d+ of \d+)",
         },
+        spread=True,
     ),
     Study(
         "engine_accuracy",
