@@ -176,7 +176,7 @@ class Estimator:
         sigma_v_mps: float = float("nan"),
         fix: Fix | int | str | None = None,
     ) -> None:
-        """Antenna position and 1 sigma (3,), ENU m (NaN height: unknown); velocity (3,) ENU m/s if known.
+        """Antenna position (3,) and 1 sigma, one or (3,), ENU m (NaN height: unknown); velocity (3,) ENU m/s.
 
         `fix` is the class of fix ("single" to "fixed"); it gives the sigma where none is sensible.
         """

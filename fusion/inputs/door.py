@@ -30,8 +30,9 @@ LEAP_NS, LONGEST_LEAP_NS, LEAP_STEPS = 1_000_000_000, 10_000_000_000, 10
 """A sample this much newer than all others, and by so many of the steps before, is no next sample, unless
 others confirm its time; beyond the longest always."""
 STEPS_SEEN = 8
-CONFIRMED = 3
-"""Samples that show that time has leapt."""
+CONFIRMED, CONFIRMED_NS = 3, 500_000_000
+"""Samples that show that time has leapt, and the time that they must span: in it another stream that goes on
+would have shown that it has not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +54,18 @@ class GnssFix:
 class Newest:
     """Time of the newest sample of IMU and wheels; None before the first.
 
-    `refused` counts, by channel, samples far ahead of it; `steps_ns` has the last steps of time.
+    `refused` counts, by channel, samples far ahead of it; `steps_ns` has the last steps of time; `taken`
+    counts the samples that are used.
     """
 
     t_ns: int | None = None
     refused: dict[str, int] = field(default_factory=dict)
     steps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
+    taken: int = 0
 
     def advance(self, t_ns: int) -> None:
         """Take the time of a sample that is used."""
+        self.taken += 1
         if self.t_ns is None or t_ns > self.t_ns:
             if self.t_ns is not None:
                 self.steps_ns.append(t_ns - self.t_ns)
@@ -97,11 +101,13 @@ class Leap:
     Attributes:
         newest: of all streams.
         held: samples ahead, each beginning with its time.
-        dropped: number of samples whose time no other confirmed.
+        taken: samples that had been used when the first of `held` came.
+        dropped: number of samples whose time no other confirmed, or another stream contradicted.
     """
 
     newest: Newest
     held: list[tuple[Any, ...]] = field(default_factory=list)
+    taken: int = 0
     dropped: int = 0
 
     def admitted(self, sample: tuple[Any, ...]) -> list[tuple[Any, ...]]:
@@ -111,14 +117,18 @@ class Leap:
             before = self.held[:]
             self.held.clear()
         if self.held and not (
-            self.newest.leaps(t_ns) and abs(t_ns - self.held[-1][0]) <= self.newest.leap_ns()
+            self.newest.leaps(t_ns)
+            and abs(t_ns - self.held[-1][0]) <= self.newest.leap_ns()
+            and self.newest.taken == self.taken  # else another stream goes on as before
         ):
             self.dropped += len(self.held)
             self.held.clear()
         samples = [*before, sample]
         if self.newest.leaps(t_ns):
+            self.taken = self.newest.taken
             self.held.append(sample)
-            if len(self.held) < CONFIRMED:
+            span_ns = abs(t_ns - self.held[0][0])
+            if len(self.held) < CONFIRMED or span_ns < CONFIRMED_NS:
                 return []
             samples = sorted(self.held, key=lambda one: one[0])
             self.held.clear()
@@ -236,10 +246,17 @@ def checked_fix(
 def _sigma_of(sigma_m: ArrayLike | None, known: Fix | None) -> Array | None:
     """1 sigma (3,) of a fix, NaN where its height is unknown; None where it is of no use."""
     sigma = np.full(3, np.nan) if sigma_m is None else np.array(as_numbers(sigma_m, "sigma", "gnss"))
-    sensible = sigma.shape == (3,) and ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
+    if sigma.ndim == 0:
+        sigma = np.full(3, float(sigma))
+    if sigma.shape != (3,):
+        raise DataError(
+            f"sigma {sigma.tolist()} is neither one number nor three", channel="gnss",
+            remedy="give metres, 1 sigma, for east, north and up",
+        )  # fmt: skip
+    sensible = ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
     if not sensible and known is not None:
         sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
-    elif sigma.shape != (3,) or not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
+    elif not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
         raise DataError(
             f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
         )

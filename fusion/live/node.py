@@ -276,6 +276,8 @@ class LiveNode:
     def _order(self, t_ns: int, kind: str, sample: Any) -> None:
         newest_ns = self._leap.newest.t_ns
         if kind != "imu":
+            if kind == "wheels" and not self._leap.newest.leaps(t_ns):
+                self._leap.newest.taken += 1  # an IMU that leaps alone is not followed
             self._ordered.add(t_ns, kind, sample)
             return
         if newest_ns is not None and newest_ns - t_ns > MOST_LATE_S * 1e9:

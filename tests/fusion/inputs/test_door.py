@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.messages import ImuSample, Message, WheelSample
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.inputs.door import Leap, Newest, checked_fix, checked_time
@@ -109,6 +109,22 @@ def test_a_stamp_far_ahead_is_left_out_and_the_stream_goes_on(
     assert any(f"samples of {channel}" in note and "left out" in note for note in notes_of(estimator))
 
 
+@pytest.mark.parametrize("ahead_ns", [10 * 10**9, HOUR_NS])
+@pytest.mark.parametrize("kind", [ImuSample, WheelSample])
+def test_a_clock_that_leaps_for_a_while_is_not_followed_while_the_other_goes_on(
+    running: Running, kind: type, ahead_ns: int
+) -> None:
+    estimator, until_ns = running.again(), running.now_ns + 10**9
+    for message in running.rest:
+        leaps = isinstance(message, kind) and message.t_ns < until_ns
+        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if leaps else message)
+    state = estimator.latest()
+    assert state is not None
+    assert abs(state.t_ns - running.rest[-1].t_ns) < 10**9
+    assert np.linalg.norm(state.position_m - running.end_m) < 0.1
+    assert any("ahead of all others" in note for note in notes_of(estimator))
+
+
 @pytest.mark.parametrize("ahead_s", [1.5, 4.0, 6.0, 9.0])
 @pytest.mark.parametrize("channel", ["imu", "wheels"])
 def test_a_stamp_some_seconds_ahead_costs_nothing(running: Running, channel: str, ahead_s: float) -> None:
@@ -174,8 +190,8 @@ def test_lone_leaps_are_dropped_and_a_pause_loses_nothing(pattern: list[tuple[in
     admitted += leap.admitted((t,))
     assert all(one[0] < HOUR_NS for one in admitted)
     assert leap.dropped == lone
-    resumed = [one for i in range(4) for one in leap.admitted((2 * HOUR_NS + i * 10**8,))]
-    assert len(resumed) == 4
+    resumed = [one for i in range(8) for one in leap.admitted((2 * HOUR_NS + i * 10**8,))]
+    assert len(resumed) == 8
 
 
 # --- values --------------------------------------------------------------------------------------------
@@ -270,6 +286,11 @@ def test_the_numbers_of_a_fix() -> None:
     endless = checked_fix(0, [1.0, 2.0, np.inf], [0.1, 0.1, 0.1], None, np.nan, None)
     assert endless is not None
     assert np.isnan(endless.enu_m[2]), "a height that is none is free"
+    plain = checked_fix(0, np.zeros(3), 0.02, None, np.nan, "fixed")
+    assert plain is not None
+    assert plain.sigma_m.tolist() == [0.02] * 3, "one number is that of all axes"
+    with pytest.raises(DataError, match="neither one number nor three"):
+        checked_fix(0, np.zeros(3), [0.1, 0.1], None, np.nan, "fixed")
     tiny = checked_fix(0, np.zeros(3), [1e-300] * 3, None, np.nan, None)
     assert tiny is not None
     assert tiny.sigma_m.tolist() == [1e-3] * 3
