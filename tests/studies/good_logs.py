@@ -11,7 +11,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from pathlib import Path
 
 import terrafusion as tf
 from terrafusion.datasets.catalog.catalog import load_catalog, locate
@@ -20,6 +21,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.cli.common import rig_of
+from tests.studies.parts import TaskWorkers, add_options, answers
 
 KNOWN = {
     "borealtc": {"clock-offset", "clock-drift"},
@@ -60,9 +62,11 @@ def field_names() -> Iterator[str]:
                 yield name
 
 
-def _field(names: Iterable[str]) -> Iterator[tuple[str, Recording]]:
-    for name in names:
-        yield from ((name, recording) for recording in open_recordings(name))
+def offered(trial: tuple[str, str | int]) -> list[tuple[str, list[str]]]:
+    """Name and codes of every recording of a field log, or of a run of the twin."""
+    kind, which = trial
+    logs = open_recordings(str(which)) if kind == "log" else [simulated(int(which))]
+    return [(log.name, sorted(repairs_offered(log))) for log in logs]
 
 
 def main() -> None:
@@ -70,23 +74,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("logs", nargs="*", help="by default all of the catalogue that are here")
     parser.add_argument("--runs", type=int, default=50)
-    options = parser.parse_args()
-    field, changed = 0, 0
-    for name, recording in _field(options.logs or field_names()):
-        codes = repairs_offered(recording)
-        field, changed = field + 1, changed + bool(codes - known_faults(name))
-        if codes:
-            known = " (known)" if codes <= known_faults(name) else ""
-            print(f"{recording.name}: {', '.join(sorted(codes))}{known}")
+    parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
+    add_options(parser)
+    given = parser.parse_args()
+    names, seeds = given.logs or [*field_names()], range(given.runs)
+    trials = [*(("log", name) for name in names), *(("run", seed) for seed in seeds)]
+    found = answers(trials, offered, TaskWorkers.of(given), given.out)
+    field, changed, runs = 0, 0, 0
+    for name, rows in zip(names, found, strict=False):
+        for called, codes in rows:
+            true = known_faults(name)
+            field, changed = field + 1, changed + bool(set(codes) - true)
+            if codes:
+                print(f"{called}: {', '.join(codes)}{' (known)' if set(codes) <= true else ''}")
     print(f"field logs {field}, of which a repair would change {changed}")
-    runs = 0
-    for seed in range(options.runs):
-        codes = repairs_offered(simulated(seed))
+    for seed, [(_, codes)] in zip(seeds, found[len(names) :], strict=True):
         runs += bool(codes)
         if codes:
-            print(f"run {seed}: {', '.join(sorted(codes))}")
-    print(f"simulated runs {options.runs}, of which a repair would change {runs}")
+            print(f"run {seed}: {', '.join(codes)}")
+    print(f"simulated runs {given.runs}, of which a repair would change {runs}")
 
 
 if __name__ == "__main__":
-    main()
+    from tests.studies import good_logs
+
+    good_logs.main()  # workers know the logs by the module's own name

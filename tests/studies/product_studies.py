@@ -8,12 +8,13 @@ PRODUCT = (
     Study(
         "good_logs",
         "Do the log checks offer repairs for logs in which nothing is wrong?",
-        module("good_logs"),
+        module("good_logs", "--out", OUT),
         5,
         {
             "field_logs_changed": r"field logs \d+, of which a repair would change (\d+)",
             "runs_changed": r"simulated runs \d+, of which a repair would change (\d+)",
         },
+        spread=True,
     ),
     Study(
         "first_hour",
