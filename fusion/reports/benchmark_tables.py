@@ -24,16 +24,22 @@ from terrafusion.fusion.metrics.pooled_consistency import VERDICT_SIGNS, PooledC
 
 Cells = list[str]
 NOT_SIGNIFICANT = " (not significant)"
+WORDS = ("what", "verdict", "beaten by", "cause", "largest loss", "plant, arm", "arm", "why", "is")
+"""Heads of columns of words; the first column is one, too."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A table with an explanation; its first column is text, the others are numbers or words."""
+    """A table with an explanation."""
 
     title: str
     about: str
     heads: tuple[str, ...]
     rows: tuple[Cells, ...]
+
+    def numbers(self) -> list[int]:
+        """The columns of numbers."""
+        return [i for i, head in enumerate(self.heads) if i and head not in WORDS]
 
     def markdown(self) -> list[str]:
         """Lines of a section of a document."""
