@@ -5,7 +5,7 @@ drives share. Between nodes the path is dead reckoning with the numbers (`motion
 about the wheel scale, the receiver drifts as a Gauss-Markov process, and fixes have a robust loss (Cauchy;
 iteratively reweighted, Holland and Welsch 1977, Commun. Stat. A6). Gauss-Newton; each drive is reduced to
 the numbers by a Schur complement (`reduction`), so that the result's covariance is that of the numbers with
-all else unknown. The spread of slip is estimated by expectation maximisation.
+all else unknown. The spread and the correlation time of slip are estimated, too (`slip`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.motion import Drive, dead_reckoned
 from terrafusion.fusion.calibration.numbers import WHEEL_SCALE, Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, RATIO, YAW, Nodes, Noise, Reduction, X, Y
+from terrafusion.fusion.calibration.slip import slip_process
 
-SPREAD_PRIOR_NODES = 3.0
-"""Nodes that the assumed spread of slip counts for."""
-LEAST_SPREAD = 0.005
 ITERATIONS, CONVERGED = 10, 0.02
 """Gauss-Newton steps at most; done when no number moves by more than this share of its sigma."""
 
@@ -65,8 +63,8 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
     covariance = np.linalg.inv(information)
     step = covariance @ right
     numbers = now.mean + step
-    squares = [one.apply(step, numbers) for one in reduced]
-    return Knowledge(numbers, covariance, _spread(squares, before.slip_spread))
+    moments = [one.apply(step, numbers) for one in reduced]
+    return Knowledge(numbers, covariance, *slip_process(moments, before.slip_spread, before.slip_time_s))
 
 
 def started(drive: Drive, start: complex, yaw_rad: float, numbers: Array) -> Nodes:
@@ -77,13 +75,6 @@ def started(drive: Drive, start: complex, yaw_rad: float, numbers: Array) -> Nod
     state[:, X], state[:, Y] = at.real, at.imag
     state[:, YAW], state[:, RATIO] = yaw_rad + path.yaw_rad[first], numbers[WHEEL_SCALE]
     return Nodes(drive, state)
-
-
-def _spread(squares: Sequence[Array], assumed: float) -> float:
-    """Standard deviation of the distance ratio, from its expected squares (n,) of each drive."""
-    total = SPREAD_PRIOR_NODES * assumed**2 + sum(float(s.sum()) for s in squares)
-    count = SPREAD_PRIOR_NODES + sum(len(s) for s in squares)
-    return max(float(np.sqrt(total / count)), LEAST_SPREAD)
 
 
 def information_gained(before: Knowledge, after: Knowledge) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,17 +49,19 @@ the turn scale where there is no gyro."""
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """Mean and covariance of `NUMBERS`, and the spread of slip between stretches of ground.
+    """Mean and covariance of `NUMBERS`, and how slip changes between stretches of ground.
 
     Attributes:
         mean: (7,).
         covariance: (7, 7).
         slip_spread: standard deviation of the distance ratio about `wheel_scale`.
+        slip_time_s: correlation time of that ratio.
     """
 
     mean: Array
     covariance: Array
     slip_spread: float
+    slip_time_s: float
 
     @property
     def sigma(self) -> Array:
@@ -70,7 +73,9 @@ class Knowledge:
         return np.asarray(np.minimum(np.hypot(self.sigma, IMITATED), before.sigma))
 
 
-def assumed(bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float) -> Knowledge:
+def assumed(
+    bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float, slip_time_s: float
+) -> Knowledge:
     """What is known of a robot before it drives."""
     sigma = np.array(
         [
@@ -83,7 +88,7 @@ def assumed(bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float) ->
             WHEEL_DELAY_SIGMA_S,
         ]
     )
-    return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread)
+    return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread, slip_time_s)
 
 
 def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
@@ -103,7 +108,7 @@ def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
                 sigma[row] = min(np.hypot(sigma[row], change[row]), wide.sigma[row])
         elif number.known in LENGTH_SIGMA_M:
             sigma[row] = LENGTH_SIGMA_M[number.known]
-    return Knowledge(mean, np.diag(sigma**2), wide.slip_spread)
+    return dataclasses.replace(wide, mean=mean, covariance=np.diag(sigma**2))
 
 
 def _change_sigma(yaw: str) -> Array:
@@ -132,4 +137,4 @@ def for_the_next_run(known: Knowledge, wide: Knowledge, yaw: str) -> Knowledge:
     covariance = known.covariance + np.diag(_change_sigma(yaw) ** 2)
     limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
     shrink = np.sqrt(limit / np.diag(covariance))
-    return Knowledge(known.mean, covariance * np.outer(shrink, shrink), known.slip_spread)
+    return dataclasses.replace(known, covariance=covariance * np.outer(shrink, shrink))

@@ -23,6 +23,7 @@ from terrafusion.fusion.calibration.numbers import (
     NUMBERS,
     WHEEL_SCALE,
 )
+from terrafusion.fusion.calibration.slip import SlipMoments
 
 Places = NDArray[np.intp]
 
@@ -135,8 +136,8 @@ class Reduction:
             return True
         return False
 
-    def apply(self, step: Array, numbers: Array) -> Array:
-        """Move the nodes by the step of the numbers; expected squares (n,) of the ratios about their mean."""
+    def apply(self, step: Array, numbers: Array) -> SlipMoments:
+        """Move the nodes by the step of the numbers; moments of the ratios about the wheel scale."""
         part, n = self.part, self.own.size
         moved = self._solved((self.own - self.border @ step).reshape(n))
         part.state = part.state + moved.reshape(-1, NODE)
@@ -145,8 +146,18 @@ class Reduction:
         driving = np.flatnonzero(np.diff(rolled) > 1.0)
         unit = np.zeros((n, len(driving)), order="F")
         unit[driving * NODE + RATIO, np.arange(len(driving))] = 1.0
-        variance = self._solved(unit)[driving * NODE + RATIO, np.arange(len(driving))]
-        return np.asarray((part.state[driving, RATIO] - numbers[WHEEL_SCALE]) ** 2 + variance)
+        covariance = self._solved(unit)[driving * NODE + RATIO]
+        off, variance = part.state[driving, RATIO] - numbers[WHEEL_SCALE], np.diag(covariance)
+        begin = np.flatnonzero(np.diff(driving) == 1)
+        told = np.clip(1.0 - variance / self.spread**2, 0.0, 1.0)
+        told = told[begin] * told[begin + 1]
+        return SlipMoments(
+            nodes=len(driving),
+            squares=float((off**2 + variance).sum()),
+            products=float((off[begin] * off[begin + 1] + covariance[begin, begin + 1]).sum()),
+            told=float(told.sum()),
+            apart_s=float(told @ np.diff(drive.t_s[drive.first])[driving[begin]]),
+        )
 
     def _assemble_links(self) -> None:
         drive, begin = self.part.drive, self.done_nodes

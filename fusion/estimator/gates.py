@@ -165,7 +165,9 @@ def wheel_innovation(
     R, rolled_m, sigma_m = before.rotation, float(wheels.displacement_m[0]), float(wheels.sigma[0])
     forward = R[:, 0]
     moved_m = float(forward @ (point.pose.translation() - before.pose.translation()))
-    slip_variance = float(P[SLIP, SLIP]) + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch)
+    slip_variance = float(P[SLIP, SLIP]) + noise.slip_sigma**2 * (
+        min(2.0 * dt_s / noise.slip_time_s, 1.0) + switch
+    )
     variance = (
         sigma_m * sigma_m
         + rolled_m * rolled_m * slip_variance

@@ -33,6 +33,7 @@ from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.slow_states import SLIP_STEADY
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -248,7 +249,8 @@ class LearnedNumbers:
         if not slip:
             return
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
-        self._weights.learn_slip(-float(known.mean[WHEEL_SCALE]), max(doubt, LEAST_SLIP_SIGMA), t_ns)
+        mean, time_s = -float(known.mean[WHEEL_SCALE]), known.slip_time_s / SLIP_STEADY
+        self._weights.learn_slip(mean, max(doubt, LEAST_SLIP_SIGMA), time_s, t_ns)
 
     def _corrections(self, known: Knowledge) -> Array:
         """The numbers (4,) of `CORRECTED`: as known before, but where the drive clearly shows others.
@@ -278,7 +280,8 @@ def _doubt_place(chain: Chain, moved_m: float) -> None:
 def _prior(config: EstimatorConfig) -> Knowledge:
     """What is known of the robot before it drives."""
     yaw, bias_sigma = config.inputs.yaw, config.rig.sensors.imu.gyro_bias_sigma_radps
-    wide = assumed(bias_sigma, yaw in ("wheels", "steering"), SLIP_SPREAD)
+    slip_time_s = SLIP_STEADY * config.policy.fixed.slip_time_s
+    wide = assumed(bias_sigma, yaw in ("wheels", "steering"), SLIP_SPREAD, slip_time_s)
     return known_before(config.rig.known, wide, yaw)
 
 

@@ -68,7 +68,7 @@ class TerrainNoise:
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
         self._driven = DrivenSlip(self.policy)
-        self._slips = self._driven.posterior()
+        self._slips, self._slip_times_s = self._driven.posterior(), self.policy.slips()[3].copy()
         self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=MOST_CHANGES)
         self._recorded: SensorNoise | None = None
@@ -82,13 +82,18 @@ class TerrainNoise:
         self._last_speed = np.nan
         self._source = "detector"
 
-    def learn_slip(self, mean: float, sigma: float, t_ns: int) -> None:
-        """Take over the slip that the robot itself shows, for the ground that no class describes."""
+    def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
+        """Take over the slip that the robot itself shows, for the ground that no class describes.
+
+        `time_s`: correlation time of the slip of whole runs, which is at most the policy's.
+        """
+        time_s = min(time_s, self.policy.fixed.slip_time_s)
         if not self.adaptive:
-            self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma)
+            self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma, slip_time_s=time_s)
         elif self._starts_pooled:
-            unknown, (means, sigmas) = self.detector.classes.index(UNKNOWN), self._slips
-            means[unknown], sigmas[unknown] = mean, sigma
+            own = self.detector.classes.index(UNKNOWN)
+            means, sigmas = self._slips
+            means[own], sigmas[own], self._slip_times_s[own] = mean, sigma, time_s
             self._reweight(t_ns)
 
     def learned_grounds(self) -> GroundMemory | None:
@@ -234,7 +239,7 @@ class TerrainNoise:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.noise = self.policy.blend(self._shares, self._grade, self._slips)
+        self.noise = self.policy.blend(self._shares, self._grade, (*self._slips, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)

@@ -126,7 +126,7 @@ def test_the_file_carries_the_numbers_to_the_next_replay(
 
 
 def test_a_log_gives_no_more_than_changes_between_runs_allow() -> None:
-    wide = assumed(1e-3, False, 0.05)
+    wide = assumed(1e-3, False, 0.05, 300.0)
     sure = dataclasses.replace(wide, covariance=1e-6 * wide.covariance)
     after = for_the_next_run(sure, wide, "gyro")
     assert after.sigma[ANTENNA_X] == pytest.approx(sure.sigma[ANTENNA_X])
@@ -135,7 +135,7 @@ def test_a_log_gives_no_more_than_changes_between_runs_allow() -> None:
 
 
 def test_the_prior_follows_how_a_number_is_known() -> None:
-    wide = assumed(1e-3, False, 0.05)
+    wide = assumed(1e-3, False, 0.05, 300.0)
     for known, sigma, expected in (
         ("measured", None, 0.02),
         ("data_sheet", None, 0.05),
@@ -157,10 +157,12 @@ def test_the_prior_follows_how_a_number_is_known() -> None:
     assert prior.mean[TURN_SCALE] == 0.03
     assert 0.002 <= prior.sigma[TURN_SCALE] < 0.004
     assert (prior.mean[GNSS_DELAY], prior.sigma[GNSS_DELAY]) == (0.4, wide.sigma[GNSS_DELAY])
-    by_wheels = known_before(numbers, assumed(1e-3, True, 0.05), "wheels")
+    by_wheels = known_before(numbers, assumed(1e-3, True, 0.05, 300.0), "wheels")
     assert by_wheels.mean[TURN_SCALE] == 0.0
-    by_steering = known_before(numbers, assumed(1e-3, True, 0.05), "steering")
-    assert by_steering.sigma[TURN_SCALE] == assumed(1e-3, True, 0.05).sigma[TURN_SCALE]  # neither is its own
+    by_steering = known_before(numbers, assumed(1e-3, True, 0.05, 300.0), "steering")
+    assert (
+        by_steering.sigma[TURN_SCALE] == assumed(1e-3, True, 0.05, 300.0).sigma[TURN_SCALE]
+    )  # neither is its own
     assert by_wheels.sigma[TURN_SCALE] == pytest.approx(np.hypot(0.1, 0.05))  # grounds differ
 
 
@@ -168,7 +170,7 @@ def test_without_any_number_nothing_changes() -> None:
     for name in ("elevate", "husky", "generic"):
         rig = load_vehicle(name).rig()
         assert rig.known == SensorNumbers()
-        wide = assumed(rig.sensors.imu.gyro_bias_sigma_radps, False, 0.05)
+        wide = assumed(rig.sensors.imu.gyro_bias_sigma_radps, False, 0.05, 300.0)
         assert np.array_equal(known_before(rig.known, wide, "gyro").covariance, wide.covariance)
 
 

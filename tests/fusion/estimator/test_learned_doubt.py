@@ -40,7 +40,7 @@ def noise() -> SensorNoise:
 def known() -> Knowledge:
     variance = np.zeros(len(NUMBERS))
     variance[TURN_SCALE] = SCALE_SIGMA**2
-    return Knowledge(np.zeros(len(NUMBERS)), np.diag(variance), 0.05)
+    return Knowledge(np.zeros(len(NUMBERS)), np.diag(variance), 0.05, 300.0)
 
 
 def added_density(unaided_s: float, rate_radps: float = RATE_RADPS) -> float:
@@ -72,7 +72,7 @@ def test_a_delay_corrects_from_four_of_its_sigmas_on(sigma_s: float, corrected_s
     prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
     mean, sigma = prior.mean.copy(), prior.sigma
     mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.4, sigma_s
-    estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03), 1)
+    estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03, 300.0), 1)
     assert estimator.gnss.delay_s == pytest.approx(corrected_s)
 
 
@@ -84,15 +84,15 @@ def test_a_delay_is_not_corrected_by_what_the_antenna_explains() -> None:
     mean[ANTENNA_X], mean[GNSS_DELAY] = -0.12, 0.1
     covariance[ANTENNA_X, ANTENNA_X], covariance[GNSS_DELAY, GNSS_DELAY] = 0.02**2, 0.05**2
     covariance[ANTENNA_X, GNSS_DELAY] = covariance[GNSS_DELAY, ANTENNA_X] = 0.9 * 0.02 * 0.05
-    estimator.learned._apply(Knowledge(mean, covariance, 0.03), 1)
+    estimator.learned._apply(Knowledge(mean, covariance, 0.03, 300.0), 1)
     assert estimator.gnss.delay_s == 0.0
 
 
 def test_a_stated_sigma_holds_what_slip_imitates_but_no_more_than_was_known() -> None:
-    before = assumed(0.0, False, 0.05)
-    exact = Knowledge(before.mean, 1e-12 * np.eye(len(NUMBERS)), 0.05)
+    before = assumed(0.0, False, 0.05, 300.0)
+    exact = Knowledge(before.mean, 1e-12 * np.eye(len(NUMBERS)), 0.05, 300.0)
     assert exact.stated_sigma(before) == pytest.approx(np.minimum(IMITATED, before.sigma), abs=1e-5)
-    told = Knowledge(before.mean, np.diag(np.full(len(NUMBERS), 1e-3) ** 2), 0.05)
+    told = Knowledge(before.mean, np.diag(np.full(len(NUMBERS), 1e-3) ** 2), 0.05, 300.0)
     assert (exact.stated_sigma(told) <= told.sigma).all()
 
 

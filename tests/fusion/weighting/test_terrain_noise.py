@@ -72,11 +72,18 @@ def test_a_switch_is_the_share_that_changed_ground_since_it_was_last_asked() -> 
 def test_slip_that_the_robot_shows_is_that_of_ground_no_class_describes(robot: str) -> None:
     fixed, adaptive = noise_of(robot, mode="fixed"), noise_of(robot)
     for weights in (fixed, adaptive):
-        weights.learn_slip(0.3, 0.07, 5)
-    assert (fixed.noise.slip_mean, fixed.noise.slip_sigma) == (0.3, 0.07)
+        weights.learn_slip(0.3, 0.07, 0.2, 5)
+    assert (fixed.noise.slip_mean, fixed.noise.slip_sigma, fixed.noise.slip_time_s) == (0.3, 0.07, 0.2)
     knows_its_grounds = robot == "elevate"
     assert (adaptive.noise.slip_mean == pytest.approx(0.3)) != knows_its_grounds
     assert (adaptive.noise.slip_sigma == pytest.approx(0.07)) != knows_its_grounds
+    assert (adaptive.noise.slip_time_s == pytest.approx(0.2)) != knows_its_grounds
+
+
+def test_no_slip_lasts_longer_than_the_policy_says() -> None:
+    weights = noise_of("husky", mode="fixed")
+    weights.learn_slip(0.0, 0.05, 1000.0, 0)
+    assert weights.noise.slip_time_s == weights.policy.fixed.slip_time_s
 
 
 def test_changes_of_the_noise_are_recorded_from_a_tenth_on_with_their_reason() -> None:
@@ -145,9 +152,9 @@ def test_the_window_of_the_detector_is_that_of_the_last_second() -> None:
 def test_noise_begins_on_the_level() -> None:
     weights = noise_of("elevate")
     weights.begin(0)
-    mean, sigma, *_ = weights.policy.slips()
+    mean, sigma, _, time_s = weights.policy.slips()
     p = np.array(list(weights.posterior().values()))
-    assert weights.noise == weights.policy.blend(p, 0.0, (mean, sigma))
+    assert weights.noise == weights.policy.blend(p, 0.0, (mean, sigma, time_s))
 
 
 def test_grounds_are_learned_only_where_a_memory_is_given() -> None:

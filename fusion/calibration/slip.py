@@ -1,0 +1,54 @@
+"""Spread and correlation time of slip between stretches of ground, from the nodes of a drive's smoother.
+
+The smoother takes the ratios of nodes as independent about the wheel scale. Their expected squares give the
+spread (expectation maximisation), and their expected products the correlation from one node to the next,
+where they are known: a node of which the fixes tell the share g of its variance counts by g.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+PRIOR_NODES = 3.0
+"""Nodes that the assumed spread and correlation of slip count for."""
+LEAST_SPREAD = 0.005
+LEAST_NODE_SHARE = 0.5
+"""Least correlation time over the time between nodes: within a node slip is not seen."""
+
+
+@dataclass(frozen=True)
+class SlipMoments:
+    """Sums over the nodes of a drive in which the robot drove.
+
+    Attributes:
+        nodes: their number.
+        squares: of the expected squares of the ratios about the wheel scale.
+        products: of the expected products of neighbours.
+        told: of the products' shares that fixes tell, g g'.
+        apart_s: of the times between neighbours, by these shares.
+    """
+
+    nodes: int
+    squares: float
+    products: float
+    told: float
+    apart_s: float
+
+
+def slip_process(
+    moments: Sequence[SlipMoments], assumed_spread: float, assumed_time_s: float
+) -> tuple[float, float]:
+    """Spread and correlation time, s, of slip; the time is at most the one assumed."""
+    nodes = PRIOR_NODES + sum(m.nodes for m in moments)
+    spread = math.sqrt((PRIOR_NODES * assumed_spread**2 + sum(m.squares for m in moments)) / nodes)
+    spread, told = max(spread, LEAST_SPREAD), sum(m.told for m in moments)
+    if told <= 0.0:
+        return spread, assumed_time_s
+    apart_s = sum(m.apart_s for m in moments) / told
+    assumed = math.exp(-apart_s / assumed_time_s)
+    seen = sum(m.products for m in moments) / spread**2
+    correlation = (PRIOR_NODES * assumed + seen) / (PRIOR_NODES + told)
+    least = math.exp(-1.0 / LEAST_NODE_SHARE)
+    return spread, -apart_s / math.log(min(max(correlation, least), assumed))
