@@ -35,6 +35,9 @@ ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
 """1 sigma of an angle of which nothing is known."""
 LEAST_SIGMA_RAD = math.radians(1.0)
 """Wheels that slip with acceleration turn the vector by as much (assumed)."""
+SQUARE_SHARE, SQUARE_SIGMA_RAD = 0.8, math.radians(2.0)
+"""Share of IMUs whose axes are those of the body or turned by right angles, and 1 sigma of these; others are
+turned by any angle (assumed)."""
 PLACE_M = 0.5
 """1 sigma of the place of the IMU, each axis: it is somewhere on a robot (assumed)."""
 JOINT = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 1.0]])
@@ -53,6 +56,19 @@ class Angle:
         share = self.sigma_rad**2 / (self.sigma_rad**2 + other.sigma_rad**2)
         rad = self.rad + share * math.remainder(other.rad - self.rad, math.tau)
         return Angle(math.remainder(rad, math.tau), other.sigma_rad * math.sqrt(share))
+
+    def as_mounted(self) -> Angle:
+        """Mean and 1 sigma given that most IMUs are mounted at right angles, where nothing else is known.
+
+        The prior is a mixture of the four right angles and of any angle; the far ones are left out.
+        """
+        off = math.remainder(self.rad, 0.5 * math.pi)
+        found, square = self.sigma_rad**2, SQUARE_SIGMA_RAD**2
+        likely = math.exp(-0.5 * off**2 / (found + square)) / math.sqrt(math.tau * (found + square))
+        near, anywhere = 0.25 * SQUARE_SHARE * likely, (1.0 - SQUARE_SHARE) / math.tau
+        p, step = near / (near + anywhere), -off * found / (found + square)
+        variance = p * found * square / (found + square) + (1.0 - p) * found + p * (1.0 - p) * step**2
+        return Angle(math.remainder(self.rad + p * step, math.tau), math.sqrt(variance))
 
 
 class MountingAngle:

@@ -11,8 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-PRIOR_NODES = 3.0
-"""Nodes that the assumed spread and correlation of slip count for."""
+PRIOR_NODES, PRIOR_PAIRS = 3.0, 30.0
+"""Nodes that the assumed spread of slip counts for, and pairs of neighbours that the assumed correlation
+counts for: a wheel that breaks loose once is no slip that comes and goes (assumed)."""
 LEAST_SPREAD = 0.005
 LEAST_NODE_SHARE = 0.5
 """Least correlation time over the time between nodes: within a node slip is not seen."""
@@ -49,6 +50,6 @@ def slip_process(
     apart_s = sum(m.apart_s for m in moments) / told
     assumed = math.exp(-apart_s / assumed_time_s)
     seen = sum(m.products for m in moments) / spread**2
-    correlation = (PRIOR_NODES * assumed + seen) / (PRIOR_NODES + told)
+    correlation = (PRIOR_PAIRS * assumed + seen) / (PRIOR_PAIRS + told)
     least = math.exp(-1.0 / LEAST_NODE_SHARE)
     return spread, -apart_s / math.log(min(max(correlation, least), assumed))

@@ -16,6 +16,8 @@ from terrafusion.fusion.noise.policy import SensorNoise
 
 FAULT = 3.0
 """A wheel increment this many limits off is no measurement at all (a counter that jumps)."""
+LEAST_SLIP_TIME_S = 2.0
+"""Slip that changes faster is what a gate is to find (assumed)."""
 JUMP_MPS2 = 5.0
 """Change of wheel speed beyond the robot's (assumed): 5 cm in a keyframe of 0.1 s. Motors ramp by 1 to 3."""
 JUMP_LASTS = 2
@@ -165,9 +167,8 @@ def wheel_innovation(
     R, rolled_m, sigma_m = before.rotation, float(wheels.displacement_m[0]), float(wheels.sigma[0])
     forward = R[:, 0]
     moved_m = float(forward @ (point.pose.translation() - before.pose.translation()))
-    slip_variance = float(P[SLIP, SLIP]) + noise.slip_sigma**2 * (
-        min(2.0 * dt_s / noise.slip_time_s, 1.0) + switch
-    )
+    renewed = 2.0 * dt_s / max(noise.slip_time_s, LEAST_SLIP_TIME_S) + switch
+    slip_variance = float(P[SLIP, SLIP]) + noise.slip_sigma**2 * renewed
     variance = (
         sigma_m * sigma_m
         + rolled_m * rolled_m * slip_variance

@@ -79,7 +79,9 @@ class ImuMounting:
         if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
             return False
         was_rad = self._imu.mounting_rad
-        self.known = self._in_use(self.before.combined(self._seen.angle), chain.nodes[-1].t_ns)
+        seen = self._seen.angle
+        found = seen.as_mounted() if self.before.sigma_rad == ANY_ANGLE_RAD else self.before.combined(seen)
+        self.known = self._in_use(found, chain.nodes[-1].t_ns)
         self._imu.mounting_rad = self.known.rad
         if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
             return False

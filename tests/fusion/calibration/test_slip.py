@@ -13,7 +13,7 @@ from terrafusion.fusion.calibration.motion import Drive, node_starts
 from terrafusion.fusion.calibration.numbers import Knowledge, assumed
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.calibration.reduction import Noise
-from terrafusion.fusion.calibration.slip import PRIOR_NODES, SlipMoments, slip_process
+from terrafusion.fusion.calibration.slip import PRIOR_PAIRS, SlipMoments, slip_process
 from tests.fusion.calibration.test_online import driven
 
 STEP_S, ASSUMED_S = 0.1, 300.0
@@ -67,7 +67,7 @@ def test_the_correlation_is_that_of_the_prior_and_of_what_is_told_by_hand() -> N
     moments = SlipMoments(nodes=9, squares=9 * 0.04, products=8 * 0.02, told=8.0, apart_s=40.0)
     spread, time_s = slip_process([moments], 0.2, 50.0)
     assert spread == pytest.approx(0.2)
-    expected = (PRIOR_NODES * math.exp(-5.0 / 50.0) + 8 * 0.02 / 0.04) / (PRIOR_NODES + 8.0)
+    expected = (PRIOR_PAIRS * math.exp(-5.0 / 50.0) + 8 * 0.02 / 0.04) / (PRIOR_PAIRS + 8.0)
     assert math.exp(-5.0 / time_s) == pytest.approx(expected)
-    opposite = dataclasses.replace(moments, products=-0.3)
+    opposite = dataclasses.replace(moments, products=-2.0)
     assert slip_process([opposite], 0.2, 50.0)[1] == pytest.approx(2.5)
