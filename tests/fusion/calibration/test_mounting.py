@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.mounting import Angle, MountingAngle
+from terrafusion.fusion.calibration.mounting import SQUARE_SHARE, SQUARE_SIGMA_RAD, Angle, MountingAngle
 
 DT_S = 0.1
 
@@ -117,3 +118,26 @@ def test_angles_combine_the_short_way_round() -> None:
     assert abs(both.rad) == pytest.approx(math.pi)
     assert both.sigma_rad == pytest.approx(0.1 / math.sqrt(2.0))
     assert Angle(0.0, 1.8).combined(Angle(1.0, 0.02)).rad == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("found", [Angle(1.39, 0.12), Angle(-0.2, 0.15), Angle(0.35, 0.05), Angle(3.0, 0.2)])
+def test_the_angle_as_mounted_is_the_mean_of_right_angles_and_any_by_integration(found: Angle) -> None:
+    grid = found.rad + np.linspace(-0.7, 0.7, 200_001)
+    square = np.round(found.rad / (0.5 * np.pi)) * 0.5 * np.pi
+    at_right_angles = norm.pdf(grid, square, SQUARE_SIGMA_RAD) * SQUARE_SHARE / 4.0
+    weight = norm.pdf(grid, found.rad, found.sigma_rad) * (
+        at_right_angles + (1.0 - SQUARE_SHARE) / (2 * np.pi)
+    )
+    mean = np.average(grid, weights=weight)
+    sigma = np.sqrt(np.average((grid - mean) ** 2, weights=weight))
+    mounted = found.as_mounted()
+    assert math.remainder(mounted.rad - mean, math.tau) == pytest.approx(0.0, abs=1e-3)
+    assert mounted.sigma_rad == pytest.approx(sigma, rel=0.01)
+
+
+def test_an_angle_that_is_clear_stays_where_it_is() -> None:
+    twenty = Angle(math.radians(20.0), math.radians(3.0))
+    assert math.degrees(twenty.as_mounted().rad) == pytest.approx(20.0, abs=0.1)
+    quarter = Angle(1.39, 0.12).as_mounted()
+    assert quarter.rad == pytest.approx(0.5 * math.pi, abs=0.04)
+    assert quarter.sigma_rad < 0.1
