@@ -67,7 +67,8 @@ def verdict_line(d: GapDiagnosis) -> str:
     if verdict.kind == "no_gap":
         if d.detection.p_value <= d.significance:
             return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
-        return f"No gap: the runs differ no more than the references among themselves ({_test(d)})."
+        like = "the references among themselves" if d.references else "the twin's own runs"
+        return f"No gap: the runs differ no more than {like} ({_test(d)})."
     if verdict.kind == "unknown":
         certain = f"{percent(verdict.p_unknown)} certain"
         return f"Gap of unknown cause: no effect of the catalogue explains it ({certain})."
