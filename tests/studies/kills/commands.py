@@ -37,14 +37,13 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "gap": ("gap", "log", "--effects", "wheel_radius,gyro_bias", "--out", "out/run"),
     "benchmark": ("benchmark", "--only", "firm=1", "--jobs", "1", "--out", "out/run"),
-    "demo": ("demo", "--drives", "1", "--jobs", "1", "--out", "out/run"),
     "init": ("init", "log", "--track", "0.62", "--out", "out/robot.yaml"),
     "study": ("study", "--quick", "--seeds", "1", "--jobs", "1", "--out", "out/run"),
     "gap-blind": ("gap-blind", "--share", "0.01", "--no-opponent", "--out", "out/run"),
     "policy fit": ("policy", "fit", "--seeds", "1", "--ground", "asphalt", "--out", "out/policy.yaml"),
     "terrain train": ("terrain", "train", "--seeds", "1", "--jobs", "1", "--out", "out/model.yaml"),
 }  # fmt: skip
-"""Every command that runs for long, with little to do."""
+"""Commands that run for long, with little to do. `demo` is simulate and replay; `live` writes no file."""
 
 
 def prepared(work: Path) -> Path:
@@ -70,3 +69,14 @@ def preload() -> None:
             importlib.import_module(name)
     for part in ("fusion.replay", "fusion.cli.main", "twin.simulate", "datasets.writers"):
         importlib.import_module(f"terrafusion.{part}")
+    _shorten_training()
+
+
+def _shorten_training() -> None:
+    """Trainings on level ground without load, in this process and its children."""
+    from terrafusion.fusion.training import policy_fit, train_detector
+
+    none = (0.0,)
+    scenarios = train_detector.SCENARIOS
+    train_detector.TrainingPlan.__init__.__defaults__ = (1, scenarios, none, none)  # type: ignore[misc]
+    policy_fit.SLOPES_DEG, policy_fit.PAYLOADS_KG = none, none
