@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import StampsOption, TopicOption, VehicleOption, check_stamps, parse_topics
+from terrafusion.fusion.cli.common import (
+    StampsOption,
+    TopicOption,
+    VehicleOption,
+    check_stamps,
+    load_rig,
+    parse_topics,
+)
 
 if TYPE_CHECKING:
     from terrafusion.fusion.estimate.estimate import State
@@ -66,9 +73,6 @@ def live(
         seconds: Stop after so long; else Ctrl-C.
         foxglove (PORT): Show it in Foxglove at ws://localhost:PORT.
     """
-    if log is not None:
-        _run_log(log, vehicle, realtime)
-        return Result()
     from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.live.node import LiveOptions
 
@@ -78,7 +82,10 @@ def live(
         vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=_datum(datum),
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
     )  # fmt: skip
-    _run_robot(options, _domain(domain), loopback, reliable, seconds, foxglove)
+    if log is not None:
+        _run_log(log, options, realtime)
+    else:
+        _run_robot(options, _domain(domain), loopback, reliable, seconds, foxglove)
     return Result()
 
 
@@ -147,14 +154,16 @@ def _datum(text: str | None) -> tuple[float, float, float] | None:
     return latitude, longitude, height_m
 
 
-def _run_log(log: str, vehicle: str | None, realtime: bool) -> None:
+def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     """A recording message by message, odometry after every IMU sample."""
     from terrafusion.datasets.core.errors import DataError, errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.estimator.history import History
     from terrafusion.fusion.live.loop import live_estimator, run, verdict_of
 
-    recording = open_recording(log)
+    recording = open_recording(
+        log, rig=load_rig(options.vehicle), topics=dict(options.topics), stamps=options.stamps
+    )
     newest: list[State] = []
 
     def publish(state: State) -> None:
@@ -162,7 +171,7 @@ def _run_log(log: str, vehicle: str | None, realtime: bool) -> None:
 
     with errors_of(log):
         history = History()
-        estimator = live_estimator(recording, vehicle, history)
+        estimator = live_estimator(recording, options.vehicle, history, options.mode)
         taken = run(estimator, recording.messages(), publish, realtime)
         if not newest:
             raise DataError("the estimator never started", remedy="see `terrafusion inspect`")

@@ -18,6 +18,7 @@ from typing import Any
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.frames import NEAREST_TO_POLE_DEG
 from terrafusion.datasets.core.messages import ImuSample
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics as known
@@ -362,11 +363,15 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
     """A datum, deg and m.
 
     Raises:
-        ConfigError: it is not on Earth.
+        ConfigError: it is not on Earth, or on a pole, where no direction is east.
     """
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(height_m) <= MOST_HEIGHT_M):
+    if not (
+        abs(latitude) <= 90.0 - NEAREST_TO_POLE_DEG
+        and abs(longitude) <= 180.0
+        and abs(height_m) <= MOST_HEIGHT_M
+    ):
         raise ConfigError(
-            f"the datum {latitude:g}, {longitude:g}, {height_m:g} is not on Earth",
+            f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole, or not on Earth",
             remedy="give latitude and longitude in degrees and the height in metres",
         )
     return latitude, longitude, height_m

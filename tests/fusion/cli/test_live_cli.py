@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli.main import app
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.live.loop import live_estimator
 
 
 def test_a_log_gives_times_and_the_last_state(good_log: Path) -> None:
@@ -18,6 +21,30 @@ def test_a_log_gives_times_and_the_last_state(good_log: Path) -> None:
     assert [line.split()[0] for line in lines[:3]] == ["keyframe", "sample", "odometry"]
     assert lines[3].startswith("running: [")
     assert lines[4] == "verdict: good", lines
+
+
+def test_a_log_is_run_with_the_robot_and_in_the_mode_asked_for(
+    good_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Estimator] = []
+
+    def seen(*options: Any) -> Estimator:
+        made.append(live_estimator(*options))
+        return made[-1]
+
+    monkeypatch.setattr("terrafusion.fusion.live.loop.live_estimator", seen)
+    CliRunner().invoke(app, ["live", str(good_log), "--mode", "fixed", "--vehicle", "husky"])
+    assert (made[0].config.mode, made[0].config.vehicle) == ("fixed", "husky")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--rate", "nan"), ("--rate", "0"), ("--wait", "-1"), ("--datum", "90,0,0"), ("--datum", "nan,0,0")],
+)
+def test_options_that_make_no_sense_are_refused_with_a_log_too(
+    good_log: Path, words: tuple[str, ...]
+) -> None:
+    assert isinstance(CliRunner().invoke(app, ["live", str(good_log), *words]).exception, TerrafusionError)
 
 
 def test_a_log_that_is_not_there_is_a_known_error() -> None:

@@ -348,7 +348,14 @@ def test_a_node_does_not_listen_to_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"frequency": 0.0}, {"wait_s": 2.0}, {"datum": (91.0, 0.0, 0.0)}, {"vehicle": "no such"}]
+    "options",
+    [
+        {"frequency": 0.0},
+        {"wait_s": 2.0},
+        {"datum": (91.0, 0.0, 0.0)},
+        {"datum": (-90.0, 0.0, 0.0)},
+        {"vehicle": "no such"},
+    ],
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
