@@ -18,6 +18,7 @@ from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, until
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.reports.plots import style
+from tests.studies.axes import format_axes
 
 LOG = "norlab_drive/ice_2024_7_30_16h30s21/windows"
 OUTAGE_S, SEED = 30.0, 1
@@ -56,7 +57,7 @@ def draw(shown: Pair, every: list[Pair]) -> Figure:
         )
     right.set_xlim(-0.4, 1.4)
     right.set_ylim(bottom=0.0)
-    style.format_axes(right, y="error after 30 s without GNSS, m", title=f"all {len(every)} drives")
+    format_axes(right, y="error after 30 s without GNSS, m", title=f"all {len(every)} drives")
     return fig
 
 
@@ -74,7 +75,7 @@ def _draw_paths(ax: Axes, shown: Pair) -> None:
         ax.plot(x[inside], y[inside], color=colour, linewidth=3.0, label=f"{mode}, thick: no GNSS")
         ax.plot(x[inside][-1], y[inside][-1], "o", color=colour, markersize=8)
     ax.set_aspect("equal", adjustable="datalim")
-    style.format_axes(ax, x="east, m", y="north, m", title="Warthog on an ice rink")
+    format_axes(ax, x="east, m", y="north, m", title="Warthog on an ice rink")
     ax.legend(loc="best", fontsize=8, frameon=False)
 
 

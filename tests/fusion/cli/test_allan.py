@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
-from terrafusion.twin.analysis.allan import vehicle_lines
+from terrafusion.twin.analysis.allan import vehicle_at_rest
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
@@ -30,7 +30,7 @@ def test_a_log_at_rest_shows_the_noise_of_its_imu(terrafusion, tmp_path: Path) -
 
 
 def test_a_vehicle_has_its_parameters_beside_it() -> None:
-    lines = vehicle_lines("elevate", hours=0.2, seeds=1)
+    lines = vehicle_at_rest("elevate", hours=0.2, seeds=1).lines()
     assert lines[0].startswith("elevate: IMU at rest, 0.2 h, 1 seeds x 3 axes")
     assert sum("specified" in line for line in lines) == 6
 

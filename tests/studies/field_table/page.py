@@ -12,6 +12,7 @@ import numpy as np
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.reports.plots import style
+from tests.studies.axes import format_axes
 from tests.studies.field_table.summary import (
     OWN,
     BaselineComparison,
@@ -96,7 +97,7 @@ def plot_lines(lines: Sequence[Line]) -> Figure:
         ax.xaxis.set_minor_formatter(NullFormatter())
         for row in np.arange(len(logs) - 1) + 0.5:
             ax.axhline(row, color="#eeeeee", linewidth=0.6)
-        style.format_axes(ax, x="error, m", title=test)
+        format_axes(ax, x="error, m", title=test)
     panels[0].set_yticks(range(len(logs)), [f"{log} ({_ground(scored, log)})" for log in logs], fontsize=7)
     panels[0].set_ylim(len(logs) - 0.5, -0.5)
     errors = [max(line.error_m or 0.0, LEAST_SHOWN_M) for line in scored]

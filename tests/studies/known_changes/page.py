@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrafusion.fusion.reports.plots import style
+from tests.studies.axes import format_axes
 from tests.studies.opponents.summary import Interval, geometric_mean, ratio
 
 if TYPE_CHECKING:
@@ -149,6 +149,6 @@ def picture(found: Sequence[Found]) -> Figure:
     ax.axvline(ALLOWED, color="0.4", linewidth=1.0, linestyle="--")
     ax.set_xscale("log")
     ax.set_yticks(range(len(changes)), changes, fontsize=8)
-    style.format_axes(ax, x="median error in outages, after / before")
+    format_axes(ax, x="median error in outages, after / before")
     ax.legend(fontsize=7)
     return figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrafusion.fusion.reports.plots import style
+from tests.studies.axes import format_axes
 from tests.studies.opponents.estimators import MODES, OPPONENTS
 from tests.studies.opponents.summary import geometric_mean, losses, median, ratio
 
@@ -141,7 +141,7 @@ def picture(cells: Sequence[Cell]) -> Figure:
                 ax.scatter([c.ratio for c in found], rows, 22, colour, marker, alpha=0.75, label=label)
         ax.axvline(1.0, color="0.4", linewidth=1.0)
         ax.set_xscale("log")
-        style.format_axes(ax, x="median error / best opponent", title=known)
+        format_axes(ax, x="median error / best opponent", title=known)
         ax.set_yticks(range(len(logs)), logs, fontsize=7)
     if kinds:
         axes[0, -1].legend(fontsize=7, loc="best")
