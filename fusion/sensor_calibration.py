@@ -28,7 +28,7 @@ from terrafusion.fusion.calibration.numbers import (
 )
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import sensor_config_of, yaw_factor
+from terrafusion.fusion.config.sensor_config import SensorConfig, sensor_config_of, yaw_factor
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, with_usable_samples
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
@@ -161,13 +161,15 @@ def calibrate_sensors(
     notes += tuple(f"{name}: left out, it has no fixes or no source of yaw" for name in left_out)
     learners = [(log, learner) for log, learner in ready if learner is not None]
     yaw = _one_source_of_yaw(learners)
-    last, earlier = learners[-1][1], None
+    earlier: _Learner | None = None
     before, mounted_before = learners[0][1].known, learners[0][1].mounting.known
     for i, (log, learner) in enumerate(learners):
         with errors_of(log.name):
             share = None if progress is None else _part_of(progress, i, len(learners))
             learner.run(earlier, share)
-        earlier = learner
+            # What was learned with a wrong angle of the IMU is learned again with the right one.
+            earlier = learner.again(earlier, params) if learner.mounting.corrects else learner
+    last = earlier or learners[-1][1]
     logs = tuple(log.name for log, _ in learners)
     extends = vehicle.name if isinstance(vehicle, VehicleParams) else str(vehicle or _named(recordings[0]))
     numbers = _numbers(before, last.known, params, yaw)
@@ -216,13 +218,28 @@ class _Learner:
     def mounting(self) -> ImuMounting:
         return self.estimator.learned.mounting
 
-    def run(self, earlier: "_Learner | None", progress: Callable[[float], None] | None) -> None:
-        """Learn from the log, beginning with what the learner of an earlier one knows."""
+    def run(
+        self,
+        earlier: "_Learner | None",
+        progress: Callable[[float], None] | None,
+        mounted: Angle | None = None,
+    ) -> None:
+        """Learn from the log, beginning with what the learner of an earlier one knows, or with an angle."""
         if earlier is not None:
             known = for_the_next_run(earlier.known, self.calibration.prior, self.yaw)
             self.estimator.learned.start_from(known)
             self.mounting.start_from(earlier.mounting.known)
+        if mounted is not None:
+            self.mounting.start_from(mounted)
         feed(self.estimator, self.given, progress)
+
+    def again(self, earlier: "_Learner | None", params: VehicleParams) -> "_Learner":
+        """A learner that takes the same log with the angle of the IMU that this one found."""
+        angle, again = self.mounting.known, _started(self.given, self.estimator.config.inputs, params)
+        assert again is not None
+        again.run(earlier, None, angle)
+        again.mounting.start_from(angle)  # the log shows it once
+        return again
 
 
 def _learner(log: Recording, params: VehicleParams) -> _Learner | None:
@@ -231,7 +248,10 @@ def _learner(log: Recording, params: VehicleParams) -> _Learner | None:
         if log.gnss is None or not len(log.gnss):
             return None
         inputs = sensor_config_of(log, log.gnss)
-        given = with_usable_samples(log, inputs, log.gnss)
+        return _started(with_usable_samples(log, inputs, log.gnss), inputs, params)
+
+
+def _started(given: Recording, inputs: SensorConfig, params: VehicleParams) -> _Learner | None:
     estimator = Estimator(EstimatorConfig(params.rig(), params.name, inputs=inputs))
     calibration = estimator.learned.calibration
     return None if calibration is None else _Learner(estimator, given, calibration)

@@ -54,11 +54,23 @@ PRODUCT = (
     Study(
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
-        module("fault_matrix.matrix", "--cells", "1200", "--minutes", "120", "--out", OUT),
+        module("fault_matrix.matrix", "--cells", "1000", "--minutes", "120", "--out", OUT),
         35,
         {
             "cells": r"cells (\d+)",
             **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
+            "good_refused": r"ok and yet not good (\d+ of \d+)",
+        },
+        spread=True,
+    ),
+    Study(
+        "fault_matrix_judged",
+        "Does a wrong estimate pass as good where faults set no rule of the verdict?",
+        module("fault_matrix.matrix", "--first", "1000", "--cells", "200", "--minutes", "60", "--out", OUT),
+        8,
+        {
+            "cells": r"cells (\d+)",
+            "silent": r"silent (\d+ of \d+)",
             "good_refused": r"ok and yet not good (\d+ of \d+)",
             "named_by_check": r"- (\d+) cells in which a log check alone names a fault",
         },

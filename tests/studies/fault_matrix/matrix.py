@@ -1,6 +1,6 @@
 """A matrix of faults: does the estimator, or its verdict, fail silently?
 
-    python -m tests.studies.fault_matrix.matrix --cells 1200 --minutes 60 --out OUT
+    python -m tests.studies.fault_matrix.matrix --cells 1000 --minutes 60 --out OUT
 
 A cell is one or two faults, a log, a mode and live or batch, drawn at random with a seed: cell i is the same
 in every run, and a run of the same code goes on where one was stopped. The truth is kept from the verdict;
@@ -270,7 +270,7 @@ def run(
 def main() -> int:
     """Run and print the table; 0, or 1 after a known error."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--cells", type=int, default=1200)
+    parser.add_argument("--cells", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--faults", nargs="*", choices=[*FAULTS], default=[*FAULTS])
     parser.add_argument("--out", type=Path, required=True)
