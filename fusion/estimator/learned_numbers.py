@@ -58,8 +58,8 @@ MOST_SPREAD = 0.1
 SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
 """A slide shows within this time (assumed); so many steps of learning reach further back."""
 LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
-"""Fixes later than this can look like a slide; the delay explains them if they then lie within about three of
-their sigma: a slide leaves a hundred and more (assumed)."""
+"""Fixes later than this, another antenna or another gyro can look like a slide; they explain it if the fixes
+then lie within about three of their sigma: a slide leaves a hundred and more (assumed)."""
 CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
@@ -156,7 +156,7 @@ class LearnedNumbers:
         learning = self.calibration
         if learning is None or not learning.advance():
             return False
-        if self._before_slide is not None and not self._late_fixes(learning):
+        if self._before_slide is not None and not self._explained(learning):
             return False
         self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
         self._past.append((t_ns, self._known))
@@ -202,14 +202,14 @@ class LearnedNumbers:
         ]
 
     def _mark_slide(self, chain: Chain, learning: SelfCalibration, slides: bool) -> None:
-        """Keep what was known before a slide, or before late fixes that look like one.
+        """Keep what was known before a slide, or before wrong numbers that look like one.
 
-        Where late fixes explain it, learning goes on; after a slide it begins again.
+        Where other numbers explain it, learning goes on; after a slide it begins again.
         """
         if slides and self._before_slide is None:
             self._before_slide = self._untouched(chain, learning)
         elif not slides and self._before_slide is not None:
-            if not self._late_fixes(learning):
+            if not self._explained(learning):
                 self._forget(self._before_slide)
             self._before_slide = None
 
@@ -218,10 +218,14 @@ class LearnedNumbers:
         until_ns = chain.nodes[-1].t_ns - SLIDE_SEEN_NS
         return next((known for t_ns, known in reversed(self._past) if t_ns <= until_ns), learning.before)
 
-    def _late_fixes(self, learning: SelfCalibration) -> bool:
-        """Whether a constant delay of rolling wheels explains a drive that looks like a slide."""
-        late = abs(float(learning.known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY])) > LEAST_LATE_S
-        return late and learning.misfit < MOST_MISFIT and learning.known.slip_spread < MOST_SPREAD
+    def _explained(self, learning: SelfCalibration) -> bool:
+        """Whether other numbers of a robot with rolling wheels explain a drive that looks like a slide."""
+        known = learning.known
+        if learning.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
+            return False
+        off = np.abs(known.mean - self._before.mean)[CORRECTED]
+        clear = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
+        return bool(off[CORRECTED.index(GNSS_DELAY)] > LEAST_LATE_S or (off > clear).any())
 
     def _forget(self, known: Knowledge) -> None:
         self._before_slide, self._known = None, known

@@ -14,6 +14,7 @@ from terrafusion.fusion.calibration.numbers import (
     IMITATED,
     NUMBERS,
     TURN_SCALE,
+    WHEEL_SCALE,
     Knowledge,
     assumed,
 )
@@ -123,3 +124,32 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
     sure, late = (dataclasses.replace(learned.calibration.before, slip_spread=s) for s in (0.01, 0.02))
     learned._past.extend([(now_ns - SLIDE_SEEN_NS, sure), (now_ns, late)])
     assert learned._untouched(driving.chain, learned.calibration) is sure
+
+
+@pytest.mark.parametrize(
+    ("number", "off", "misfit", "explained"),
+    [
+        (ANTENNA_X, 0.25, 2.0, True),
+        (TURN_SCALE, 0.02, 2.0, True),
+        (GNSS_DELAY, 0.35, 2.0, True),
+        (ANTENNA_X, 0.1, 2.0, False),  # as slip in turns
+        (ANTENNA_X, 0.25, 100.0, False),  # the fixes lie elsewhere
+        (WHEEL_SCALE, 0.2, 2.0, False),  # corrects nothing that looks like a slide
+    ],
+)
+def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
+    driving: Estimator, number: int, off: float, misfit: float, explained: bool
+) -> None:
+    """A slide takes back what was learned, numbers of a robot with rolling wheels do not."""
+    learned, before = driving.learned, driving.learned._before
+    mean = before.mean.copy()
+    mean[number] += off
+    learning = driving.learned.calibration
+    assert learning is not None
+    was = learning.known, learning.misfit
+    learning.known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0)
+    learning.misfit = misfit
+    assert learned._explained(learning) is explained
+    learning.known = dataclasses.replace(learning.known, slip_spread=0.2)
+    assert not learned._explained(learning)
+    learning.known, learning.misfit = was
