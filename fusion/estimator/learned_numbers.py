@@ -58,8 +58,9 @@ MOST_SPREAD = 0.1
 SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
 """A slide shows within this time (assumed); so many steps of learning reach further back."""
 LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
-"""Fixes later than this, another antenna or another gyro can look like a slide; they explain it if the fixes
-then lie within about three of their sigma: a slide leaves a hundred and more (assumed)."""
+"""Fixes later than this (wheels that spin look less late), another antenna or another gyro can look like a
+slide; they explain it if the fixes then lie within about three of their sigma: a slide leaves a hundred and
+more (assumed)."""
 CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
@@ -223,9 +224,9 @@ class LearnedNumbers:
         known = learning.known
         if learning.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
             return False
-        off = np.abs(known.mean - self._before.mean)[CORRECTED]
-        clear = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
-        return bool(off[CORRECTED.index(GNSS_DELAY)] > LEAST_LATE_S or (off > clear).any())
+        least = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
+        least[CORRECTED.index(GNSS_DELAY)] = LEAST_LATE_S
+        return bool((np.abs(known.mean - self._before.mean)[CORRECTED] > least).any())
 
     def _forget(self, known: Knowledge) -> None:
         self._before_slide, self._known = None, known

@@ -133,6 +133,7 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
         (TURN_SCALE, 0.02, 2.0, True),
         (GNSS_DELAY, 0.35, 2.0, True),
         (ANTENNA_X, 0.1, 2.0, False),  # as slip in turns
+        (GNSS_DELAY, 0.25, 2.0, False),  # as wheels that spin on ice
         (ANTENNA_X, 0.25, 100.0, False),  # the fixes lie elsewhere
         (WHEEL_SCALE, 0.2, 2.0, False),  # corrects nothing that looks like a slide
     ],
