@@ -52,6 +52,18 @@ PRODUCT = (
         {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
     ),
     Study(
+        "fuzz_guided",
+        "Do inputs that reach new lines of the readers lead to a crash or a hang?",
+        module("fuzz_guided", "--cases", "1000", "--out", OUT),
+        5,
+        {
+            "cases": r"all (\d+) cases",
+            "defects": r"all \d+ cases, defects (\d+)",
+            "blind": r"blind .*?(\d+) lines",
+            "guided": r"guided .*?(\d+) lines",
+        },
+    ),
+    Study(
         "fault_matrix",
         "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
         module("fault_matrix.matrix", "--cells", "1000", "--minutes", "120", "--out", OUT),
