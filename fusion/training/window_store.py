@@ -1,5 +1,6 @@
 """Windows of finished simulated runs in a folder, so that an interrupted training continues."""
 
+import contextlib
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,12 +54,11 @@ class WindowStore:
         write_atomically(self._file(number), save)
 
     def clear(self) -> None:
-        """Remove all files: the model they were for is written."""
-        if self.folder.is_dir():
-            for file in self.folder.glob("run-*.npz*"):
-                file.unlink()
-            if not any(self.folder.iterdir()):
-                self.folder.rmdir()
+        """Remove all files, as the model is written; another training may remove them at the same time."""
+        with contextlib.suppress(OSError):
+            for file in self.folder.glob("run-*.npz"):
+                file.unlink(missing_ok=True)
+            self.folder.rmdir()
 
     def _file(self, number: int) -> Path:
         return self.folder / f"run-{number:05d}.npz"
