@@ -13,7 +13,7 @@ import pytest
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin import executors
 from tests.dask_cluster import scheduler, slow_square, wait_for_workers, worker
-from tests.studies.__main__ import spread
+from tests.studies.__main__ import executed
 from tests.studies.parts import Task, TaskWorkers, result_of, run_all
 from tests.studies.registry import STUDIES
 
@@ -65,13 +65,23 @@ def test_workers_that_are_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert all(path.stat().st_mtime_ns == then for path, then in there.items())
 
 
-def test_studies_with_many_trials_take_workers_and_the_others_say_so(capsys: pytest.CaptureFixture) -> None:
-    words = ["--backend", "dask", "--address", "tcp://127.0.0.1:8786"]
+def test_studies_with_many_trials_take_workers() -> None:
     for study in STUDIES:
-        assert spread(study, words) == (words if study.spread else [])
-        assert (f"{study.name}: runs in one process" in capsys.readouterr().out) is not study.spread
         if study.spread and study.command[0] == "-m":
             file = Path(*study.command[1].split("."))
             text = (Path(__file__).parents[2] / file).with_suffix(".py").read_text(encoding="utf-8")
             assert "add_options(parser)" in text or "parser_of(" in text
     assert sum(study.spread for study in STUDIES) >= 20
+
+
+def test_a_study_without_trials_runs_on_a_worker_as_a_whole(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="distributed is not installed")
+    whole = next(study for study in STUDIES if not study.spread)
+    words = ["-c", "import os, sys; print(os.getppid()); sys.exit(3)"]
+    with scheduler(tmp_path) as address, worker(address) as one:
+        wait_for_workers(address, 1)
+        ended = executed(whole, words, {"backend": "dask", "address": address})
+    assert (ended.returncode, ended.stderr) == (3, "")
+    assert int(ended.stdout) == one.pid
+    here = executed(whole, words, {"jobs": "2"})
+    assert (here.returncode, int(here.stdout)) == (3, os.getpid())

@@ -2,7 +2,7 @@
 
     python -m tests.studies list                  what there is, and what has been run
     python -m tests.studies run NAME... | --all   run; a study that has a result of this code is skipped
-                  [--backend dask --address ...]  trials on a cluster, of the studies that have many
+                  [--backend dask --address ...]  on a cluster: its trials, or the whole of a study without
     python -m tests.studies figures [--write]     do README and docs quote what the results hold?
 
 A result is `results/NAME.json` (figures, command, commit, time), `results/NAME.md` (what was printed) and,
@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.studies.figures import differences, documents, rewritten
+from tests.studies.parts import Ended, command, command_at
 from tests.studies.registry import STUDIES
 from tests.studies.study import DATA, OUT, Study
 
@@ -41,14 +42,16 @@ def code_of(study: Study) -> str:
     return done.stdout.strip() or "unknown"
 
 
-def spread(study: Study, workers: Sequence[str]) -> list[str]:
-    """The words about workers, for a study that takes them; another says that it does not."""
-    if workers and not study.spread:
-        print(f"{study.name}: runs in one process of this machine")
-    return [*workers] if study.spread else []
+def executed(study: Study, words: Sequence[str], workers: dict[str, str]) -> Ended:
+    """Run the study's command: its trials where the workers are, or all of it where it has no trials."""
+    if study.spread:
+        return command([*words, *(word for name, value in workers.items() for word in (f"--{name}", value))])
+    if workers.get("backend") == "dask":
+        return command_at(workers.get("address"), words)
+    return command(words)
 
 
-def run(study: Study, work: Path, again: bool, workers: Sequence[str] = ()) -> bool:
+def run(study: Study, work: Path, again: bool, workers: dict[str, str] | None = None) -> bool:
     """Run one study and keep its result; False where it failed."""
     file = RESULTS / f"{study.name}.json"
     if file.is_file() and not again and json.loads(file.read_text())["commit"] == code_of(study):
@@ -63,10 +66,9 @@ def run(study: Study, work: Path, again: bool, workers: Sequence[str] = ()) -> b
     words = [word.replace(OUT, str(out)).replace(DATA, data) for word in study.command]
     if words[0] == "terrafusion":
         words[0:1] = ["-c", "from terrafusion.fusion.cli.main import main; main()"]
-    words += spread(study, workers)
     print(f"{study.name}: about {study.minutes:g} min ...", flush=True)
     begun = time.monotonic()
-    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    done = executed(study, words, workers or {})
     if done.returncode != 0:
         print(f"{study.name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}", file=sys.stderr)
         return False
@@ -145,7 +147,7 @@ def main() -> int:
     running.add_argument("--again", action="store_true", help="also what has a result of this code")
     running.add_argument("--work", type=Path, default=ROOT / "studies-work", help="folder for parts")
     for name in WORKERS:
-        running.add_argument(f"--{name}", help="of studies with many trials, see `terrafusion sweep --help`")
+        running.add_argument(f"--{name}", help="where to run, see `terrafusion sweep --help`")
     verbs.add_parser("figures").add_argument("--write", action="store_true")
     given = parser.parse_args()
     if given.verb == "list":
@@ -159,7 +161,7 @@ def main() -> int:
     chosen = sorted(STUDIES, key=lambda s: s.minutes) if given.all else [known[n] for n in given.names]
     if not chosen:
         parser.error("name a study, or give --all")
-    workers = [word for name in WORKERS if (value := getattr(given, name)) for word in (f"--{name}", value)]
+    workers = {name: value for name in WORKERS if (value := getattr(given, name))}
     failed = [s.name for s in chosen if not run(s, given.work.absolute(), given.again, workers)]
     return int(bool(failed))
 

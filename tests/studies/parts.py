@@ -157,6 +157,31 @@ def answers(
         return [result_of(task, folder) for task in tasks]
 
 
+@dataclass(frozen=True)
+class Ended:
+    """A command that has ended: its status, and what it printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def command(words: Sequence[str]) -> Ended:
+    """Run Python with these words in the folder of the repository."""
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    return Ended(done.returncode, done.stdout, done.stderr)
+
+
+def command_at(address: str | None, words: Sequence[str]) -> Ended:
+    """The same on a worker of the Dask cluster at `address`, which has to see the folders in the words.
+
+    Raises:
+        TerrafusionError: nobody answers at the address, or all workers of the cluster are gone.
+    """
+    with open_workers("dask", 1, address) as cluster:
+        return next(iter(cluster.results(command, [(list(words),)])))
+
+
 def result_of(task: Task, folder: Path) -> Any:
     """The result of a task; None where it has not been run."""
     file = task.file(folder)
