@@ -16,6 +16,7 @@ from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import Soils, prepared, starting_model, with_common_channels
 from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.reference_soil import all_residuals, set_soil
 from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
@@ -108,6 +109,11 @@ def gather_evidence(
     noise = learn_noise(normal, judged, candidates, jobs, first)
     with ThreadPoolExecutor(jobs) as threads:
         white = list(threads.map(lambda run: whitened(run, noise), [*judged, *normal]))
+        every, usual = [*judged, *normal], reference_loudness(white[R:])
+        louder = [with_loud_noise(run, own, usual) for run, own in zip(every, white, strict=True)]
+        pairs = zip(louder, every, white, strict=True)
+        white = list(threads.map(lambda p: p[2] if p[0] is p[1] else whitened(p[0], noise), pairs))
+    judged, normal = louder[:R], louder[R:]
     clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(

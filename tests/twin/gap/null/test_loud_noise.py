@@ -1,0 +1,50 @@
+"""Noise that is louder on a drive than on the references' is no gap."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.other_drives import detect, learn_offsets
+from terrafusion.twin.gap.null import evidence as gathering
+from terrafusion.twin.gap.null.score import learn_state_sigma, score
+from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.twin.gap.runs import runs
+
+CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "track_width"])
+
+
+def shaken(run: Recording) -> Recording:
+    """With a gyro that is noisier from the middle of the run on."""
+    assert run.imu is not None
+    gyro = run.imu.gyro_radps.copy()
+    late = np.arange(len(gyro)) > len(gyro) // 2
+    gyro[late, 2] += np.random.default_rng(1).normal(0.0, 0.6, late.sum())
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
+def p_value(judged: list[Recording], references: list[Recording]) -> tuple[float, float]:
+    """Of a gap, and the mean squared white error of the yaw rate."""
+    found = gathering.gather_evidence(judged, references, load_vehicle("elevate"), None, CANDIDATES, jobs=1)
+    sigma = learn_state_sigma(found.references, initial_state_sigma(CANDIDATES))
+    offsets = learn_offsets([score(r, sigma) for r in found.references], len(CANDIDATES.keys))
+    (run,) = found.runs
+    yaw = run.error[run.channel == found.channels.index("yaw_rate_radps")]
+    p = detect([score(run, sigma)], offsets, CANDIDATES, 0).p_value
+    return p, float(np.mean(yaw**2))
+
+
+def test_louder_noise_is_no_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    references, (loud,) = runs(960, 5), map(shaken, runs(950, 1))
+    p, square = p_value([loud], references)
+    assert p > 0.05
+    assert square < 5.0
+    monkeypatch.setattr(gathering, "with_loud_noise", lambda run, white, usual: run)
+    p, square = p_value([loud], references)
+    assert p <= 0.05
+    assert square > 10.0

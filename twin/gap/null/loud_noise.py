@@ -1,0 +1,56 @@
+"""Noise that is louder in places than the references' is on average.
+
+A faster drive shakes the sensors more: on the twin's own runs the variance of a gyro grew by a hundred from a
+slow drive to a fast one. Judged by the noise of the references, that would be a gap. How loud a stretch of a
+run is shows in the differences of successive white errors, which slow errors hardly change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.data.samples import Indices, sample_map
+from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun
+
+STRETCH = 32  # samples over which noise is taken to be equally loud
+LOUD = 3.0  # times the references' variance from which a stretch counts as louder: above its own scatter
+NORMAL_MEDIAN = 0.455  # median square of a standard normal deviate
+
+
+def reference_loudness(references: Sequence[WhitenedRun]) -> Array:
+    """Mean variance (C,) of the noise by channel, at least the one that white errors have."""
+    found: list[list[float]] = [[] for _ in (references[0].log.observed if references else ())]
+    for channel, _, variance in (stretch for run in references for stretch in _stretches(run)):
+        found[channel].append(variance)
+    return np.array([max(1.0, float(np.mean(own))) if own else 1.0 for own in found])
+
+
+def with_loud_noise(run: RunResiduals, white: WhitenedRun, usual: Array) -> RunResiduals:
+    """The run with a larger sigma where its noise is louder than usual (C,), itself if it is nowhere."""
+    sigma = [o.sigma.copy() for o in run.log.observed]
+    loud = False
+    for channel, rows, variance in _stretches(white) if len(usual) else ():
+        if variance > LOUD * usual[channel]:
+            sigma[channel][rows] *= np.sqrt(variance / usual[channel])
+            loud = True
+    if not loud:
+        return run
+    observed = [dataclasses.replace(o, sigma=s) for o, s in zip(run.log.observed, sigma, strict=True)]
+    return dataclasses.replace(run, log=dataclasses.replace(run.log, observed=tuple(observed)))
+
+
+def _stretches(run: WhitenedRun) -> Iterator[tuple[int, Indices, float]]:
+    """Channel, rows in it and variance of the noise of each stretch."""
+    place, error = 0, run.error
+    for channel, _, rows in sample_map(run.log).blocks:
+        own = error[place : place + len(rows)]
+        place += len(rows)
+        parts = max(len(rows) // STRETCH, 1)
+        for some, values in zip(np.array_split(rows, parts), np.array_split(own, parts), strict=True):
+            if len(values) > 2:
+                square = np.median(np.square(np.diff(values)))
+                yield channel, some, 0.5 * float(square) / NORMAL_MEDIAN
