@@ -184,9 +184,9 @@ def run_up(log: PreparedLog, plant: Plant, inputs: Array) -> tuple[Array, Array]
     """State (X,) `LEAD_S` before the log, and the inputs from there up to the first window."""
     x = np.zeros(len(STATES))
     x[INDEX["yaw"]] = log.start[0, 2]
-    first = inputs[0].copy()
-    first[2:] = 0.0
+    first = np.zeros(len(inputs[0]))  # at rest, or the first command would have acted for `LEAD_S` already
     if np.abs(log.sides[0]).max() > MOVING_RADPS:
+        first[:2] = inputs[0, :2]
         x[state_slice("wheel_speed")] = first[[0, 1, 0, 1]]
         x[INDEX["u"]] = first[:2].mean() * plant.vehicle[VEHICLE_PARAMETERS.index("radius_m")]
     before = np.tile(first, (round(LEAD_S / DT_S), 1))
