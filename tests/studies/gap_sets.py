@@ -29,9 +29,10 @@ from terrafusion.twin.effects.catalogue import catalogue, parameters
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.calibration import Head, calibration_head, probabilities
+from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import Explanation, explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
-from terrafusion.twin.gap.infer.other_drives import detect, learn_offsets
+from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.delay import DELAYS

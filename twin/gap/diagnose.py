@@ -22,9 +22,10 @@ from terrafusion.twin.gap.answer.verdict import judge
 from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import Soils, check_distinct
+from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
-from terrafusion.twin.gap.infer.other_drives import FEWEST, detect, learn_offsets
+from terrafusion.twin.gap.infer.other_drives import FEWEST, SCATTER_SCALES, learn_offsets
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.gap.null.score import REPLICATES, Score, learn_state_sigma, replicates, score
@@ -119,7 +120,8 @@ def diagnose_evidence(
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
         normal = _with_replicates(evidence, sigma, normal, seed)
-    offsets = learn_offsets(normal, len(candidates.keys))
+    scales = SCATTER_SCALES[-1:] if uncalibrated else SCATTER_SCALES
+    offsets = learn_offsets(normal, len(candidates.keys), scales)
     planner = Planner.of(evidence, sigma, offsets, scores)
     judged, robot = evidence, offsets
     if not uncalibrated:
@@ -131,9 +133,10 @@ def diagnose_evidence(
     if progress is not None:
         progress(0.9)
     # answer: verdict, shrinkage, place, next run
-    verdict = judge(detection, significance, explanation, candidates)
     drives = drive_coverage(runs, evidence.references, evidence.model)
-    if drives is not None and drives.limits():
+    limited = drives is not None and drives.limits()
+    verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
+    if limited:
         verdict = verdict.where_drives_differ(detection.p_value <= STRICTER * significance)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit)
     where = gap_map(evidence, sigma, offsets, seed)  # the misfit of laws would hide the place

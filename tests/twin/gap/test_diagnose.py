@@ -193,11 +193,24 @@ def _swinging(run: Recording) -> Recording:
     return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
 
 
+SLOW_TURNS = dataclasses.replace(
+    DRIVE,
+    duration_s=24.0,
+    drive=tuple(
+        DriveSegment(*s) for s in ((6.0, 0.8, 0.4), (6.0, 1.2, -0.5), (6.0, 0.4, 0.9), (6.0, 0.3, -0.9))
+    ),
+)
+"""Half of it slow turns that no reference made; it sets off with its first command."""
+
+
+def test_no_gap_on_a_clean_drive_that_no_reference_made(references: list[Recording]) -> None:
+    found = diagnose([run(i, drive=SLOW_TURNS) for i in (610, 611)], references, VEHICLE)
+    assert found.detection.p_value > 0.05
+    assert found.verdict.kind == "no_gap"
+
+
 def test_undecided_where_drives_differ_and_nothing_explains_the_gap(references: list[Recording]) -> None:
-    """Clean runs, half of them slow turns that no reference made."""
-    segments = ((6.0, 0.8, 0.4), (6.0, 1.2, -0.5), (6.0, 0.4, 0.9), (6.0, 0.3, -0.9))
-    drive = dataclasses.replace(DRIVE, duration_s=24.0, drive=tuple(DriveSegment(*s) for s in segments))
-    found = diagnose([run(i, drive=drive) for i in (610, 611)], references, VEHICLE)
+    found = diagnose([_swinging(run(i, drive=SLOW_TURNS)) for i in (610, 611)], references, VEHICLE)
     answer = checked(found)
     assert answer["gap"]["p_value"] <= 0.05
     assert answer["verdict"] == "no_gap"
@@ -330,7 +343,7 @@ def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
     references: list[Recording], fresh: list[Recording], unreferred: GapDiagnosis, tmp_path: Path
 ) -> None:
     target = tmp_path / "corrected.yaml"
-    found = diagnose(runs(300, 2, WIDE), references, VEHICLE, effects=("wheel_radius", "gyro_bias"))
+    found = diagnose(runs(300, 3, WIDE), references, VEHICLE, effects=("wheel_radius", "gyro_bias"))
     said = write_corrected(found, "elevate", target)
     corrected = load_vehicle(target)
     shift = values_of(found)["wheel_radius/scale"]

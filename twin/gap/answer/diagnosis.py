@@ -8,8 +8,8 @@ from terrafusion.twin.gap.answer.next_run import NextRun
 from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.answer.where import GapCell
+from terrafusion.twin.gap.infer.detection import Detection
 from terrafusion.twin.gap.infer.explain import Explanation
-from terrafusion.twin.gap.infer.other_drives import Detection
 from terrafusion.twin.gap.null.drives import DriveCoverage
 from terrafusion.twin.gap.null.evidence import GapEvidence
 

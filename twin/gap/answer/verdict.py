@@ -11,14 +11,17 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
 from terrafusion.twin.gap.infer.calibration import Head, calibration_head, log_odds, probabilities
+from terrafusion.twin.gap.infer.detection import Detection
 from terrafusion.twin.gap.infer.explain import Explanation, Sets
-from terrafusion.twin.gap.infer.other_drives import Detection
 from terrafusion.twin.gap.infer.single_effects import Fitted
 from terrafusion.twin.gap.rollout.delay import DELAYS
 
 UNKNOWN = 0.5  # probability of an unknown cause, given a gap, above which that is the verdict
 CREDIBLE, LEAST_MEMBER = 0.95, 0.02
 """Probability of a credible set, and the least of a member, given the effects beside it."""
+FINEST_P = {False: 1e-4, True: 1e-3}
+"""Least p-value that counts as evidence of an unknown cause: below, it is extrapolated (assumed).
+Keys: whether drives are unlike the references'."""
 MOST_UNNAMED, LEAST_PROBABILITY = 3, 0.01  # further sets, and the least probability of an effect in one
 
 
@@ -97,12 +100,14 @@ def null_probability(p_value: float) -> float:
 
 def judge(
     detection: Detection, significance: float, found: Explanation, candidates: Candidates,
-    head: Head | None = None,
+    head: Head | None = None, other_drives: bool = False,
 ) -> GapVerdict:  # fmt: skip
-    """The verdict; without a head, by that of the package."""
+    """The verdict; without a head, by that of the package. On drives unlike the references', where no p-value
+    is as fine, a tiny one speaks less for an unknown cause."""
     head = calibration_head() if head is None else head
     p_null, detected = null_probability(detection.p_value), detection.p_value <= significance
-    sets, unknown = probabilities(found, len(candidates.effects), head, detection.p_value)
+    p_value = max(detection.p_value, FINEST_P[other_drives])
+    sets, unknown = probabilities(found, len(candidates.effects), head, p_value)
     unknown = unknown if detected else 0.0
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}

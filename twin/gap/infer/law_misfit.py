@@ -4,8 +4,9 @@ The robot's laws are others than the twin's. Offsets that make up for it on the 
 quite right on another drive, in proportion to what they do there (after Kennedy and O'Hagan 2001, with a
 basis in place of a Gaussian process): what they predict in a channel, and what the laws of the ground, of the
 vehicle and of the sensors predict in all of them, times functions of the commands, join the random effects as
-columns of their own. References know their coefficients as far as their drives excite them. Coefficients
-change from drive to drive, the more the less the commands of judged runs and references overlap.
+columns of their own. References know their coefficients as far as their drives excite them. These and the
+offsets themselves change from drive to drive, the more the less the commands of judged runs and references
+overlap. Only offsets beyond their uncertainty count: where the twin fits the references, none are wrong.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
-MISFIT = 0.3  # 1 sigma of a coefficient (assumed): how wrong a law is, as a share of what it does
+MISFIT = 0.3  # 1 sigma (assumed): how wrong a law is, as a share of what it does
 GROUND = frozenset(form.effect for form in GROUND_FORMS)
 
 
@@ -41,14 +42,15 @@ def with_law_misfit(
         sigma: (T,) 1 sigma of the states.
         robot: offsets without the misfit.
     """
-    groups = _groups(evidence.candidates)
+    groups, certain = _groups(evidence.candidates), robot.certain()
 
     def extended(run: WhitenedRun) -> WhitenedRun:
-        return run.with_columns(_columns(run, evidence.model, robot.mean, groups))
+        return run.with_columns(_columns(run, evidence.model, certain, groups))
 
     runs, references = ([extended(run) for run in some] for some in (evidence.runs, evidence.references))
     twists = [[commanded_twist(r.log, evidence.model)[1] for r in some] for some in (runs, references)]
-    changed = 2.0 * MISFIT**2 * (1.0 - overlap(twists[0], twists[1]))
+    count = runs[0].by_parameter.shape[1] - len(certain)
+    changed = 2.0 * MISFIT**2 * (1.0 - overlap(*twists)) * np.append(certain**2, np.ones(count))
     learned = learn_misfit([score(run, sigma) for run in references], robot, MISFIT, changed)
     return dataclasses.replace(evidence, runs=runs, references=references), learned
 

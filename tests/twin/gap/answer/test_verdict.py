@@ -8,8 +8,8 @@ import pytest
 from terrafusion.twin.gap.answer.verdict import GapVerdict, judge
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.infer.calibration import Head
+from terrafusion.twin.gap.infer.detection import Detection
 from terrafusion.twin.gap.infer.explain import Explanation
-from terrafusion.twin.gap.infer.other_drives import Detection
 from terrafusion.twin.gap.infer.single_effects import Fitted
 
 NAMES = ("soil_strength", "mass", "gyro_bias", "gyro_scale", "track_width")
@@ -27,12 +27,12 @@ def fitted(*effects: str) -> Fitted:
 
 def verdict(
     evidence: dict[tuple[str, ...], float], outside: float = -50.0,
-    detection: Detection = FOUND, alike: dict[str, set[str]] | None = None,
+    detection: Detection = FOUND, alike: dict[str, set[str]] | None = None, other_drives: bool = False,
 ) -> GapVerdict:  # fmt: skip
     every = {(name,): -50.0 for name in NAMES} | evidence
     fits = {effects: fitted(*effects) for effects in every}
     found = Explanation(every, fits, outside, alike or {}, lambda fit: [fit.values] * 3)
-    return judge(detection, 0.05, found, CANDIDATES, HEAD)
+    return judge(detection, 0.05, found, CANDIDATES, HEAD, other_drives)
 
 
 def test_two_certain_effects_are_each_certain() -> None:
@@ -72,7 +72,7 @@ def test_effects_of_the_same_signature_are_one_set_whatever_the_evidence() -> No
 
 def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     sure = Detection(9.0, 1e-12)
-    weak = verdict({("mass",): 5.0}, detection=sure)
+    weak = verdict({("mass",): 2.0}, detection=sure)
     assert weak.kind == "unknown"
     assert weak.named == ()
     assert weak.p_unknown > 0.5
@@ -82,6 +82,14 @@ def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     assert none.kind == "no_gap"
     assert none.p_unknown == 0.0
     assert none.sets == []
+
+
+def test_an_extrapolated_p_value_is_little_evidence_of_an_unknown_cause_on_other_drives() -> None:
+    kinds = [
+        verdict({("mass",): 3.0}, detection=Detection(9.0, p), other_drives=other).kind
+        for p, other in ((1e-12, False), (1e-4, False), (1e-12, True), (1e-3, True))
+    ]
+    assert kinds == ["unknown", "unknown", "effect", "effect"]
 
 
 def test_a_stronger_ground_is_a_parameter() -> None:

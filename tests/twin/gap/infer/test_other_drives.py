@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.detection import GRID, JITTER, UNKNOWN_SIZES, WIDE, Deviations, detect
 from terrafusion.twin.gap.infer.other_drives import (
     CANDIDATE_SCATTER,
-    JITTER,
+    CERTAIN,
     MISFIT_SCATTER,
     NUISANCE_SCATTER,
     PRIOR_COLUMNS,
-    UNKNOWN_SIZES,
-    WIDE,
-    _deviations,
-    detect,
+    SCATTER_SCALES,
+    RobotOffsets,
+    _log_likelihood,
     learn_misfit,
     learn_offsets,
 )
@@ -111,6 +113,11 @@ def test_what_references_do_not_show_counts_as_unknown() -> None:
     assert detect(scores(rng, 1, "other", robot), offsets, CANDIDATES, 0).p_value > 0.05
 
 
+def _of_misfit(variance: float) -> np.ndarray:
+    """That of two columns of misfit behind the others, which do not change."""
+    return np.append(np.zeros(P), [variance] * 2)
+
+
 def _where_laws_differ(seed: int, known: bool) -> float:
     """p-value on the other drive, where two modulated laws act on it otherwise than on the references'."""
     rng, sigma = np.random.default_rng(seed), 3.0
@@ -133,7 +140,9 @@ def _where_laws_differ(seed: int, known: bool) -> float:
     offsets = learn_offsets(plain(references), len(CANDIDATES.keys))
     if not known:
         return detect(plain(runs), offsets, CANDIDATES, seed).p_value
-    return detect(runs, learn_misfit(references, offsets, sigma, sigma**2), CANDIDATES, seed).p_value
+    return detect(
+        runs, learn_misfit(references, offsets, sigma, _of_misfit(sigma**2)), CANDIDATES, seed
+    ).p_value
 
 
 def test_laws_that_act_otherwise_on_another_drive_are_no_gap() -> None:
@@ -149,38 +158,112 @@ def test_the_same_seed_gives_the_same_bits() -> None:
 def test_references_that_show_nothing_teach_no_scatter_of_the_misfit() -> None:
     offsets = learn_offsets(trial(1, "reference")[0], len(CANDIDATES.keys))
     blind = [Score(np.zeros(P + 2), np.zeros((P + 2, P + 2)), 0.0, ROWS)] * 5
-    found = learn_misfit(blind, offsets, 0.5, 0.25)
+    found = learn_misfit(blind, offsets, 0.5, _of_misfit(0.25))
     np.testing.assert_allclose(found.scatter, np.append(offsets.scatter, [MISFIT_SCATTER**2] * 2))
     own = np.diag(found.covariance)
     np.testing.assert_allclose(own, np.append(offsets.prior, [0.5**2 + 0.25] * 2))
 
 
+def _parts(A: np.ndarray, changed: np.ndarray | float = 0.0) -> list[np.ndarray]:
+    """Covariance of scores: noise and offsets, change, scatter."""
+    return [A @ A + A, (A * (changed + np.zeros(len(A)))) @ A, (A * SCATTER**2) @ A]
+
+
 def test_deviations_are_likelihood_ratios() -> None:
-    """Of scores x ~ N(U c, S): by the best sizes c ~ N(0, WIDE^2) of a form, and by the mean likelihood of
-    unknown causes of several sizes."""
+    """Of scores x ~ N(U c, S): by the best sizes c ~ N(0, WIDE^2) of a form, and by the likelihood of an
+    unknown cause of a size, but for a constant."""
     from scipy.stats import multivariate_normal as normal
 
     J = 0.1 * DRIVES["other"][:40]
     A = J.T @ J
-    spread = A @ A + A
-    x = np.random.default_rng(3).standard_normal((2, P))
-    found = _deviations(A, spread, CANDIDATES)(x / (1.0 / np.sqrt(np.diag(A) + 1.0)))
+    spread = sum(_parts(A))
+    scores = np.random.default_rng(3).standard_normal((2, P)) * np.sqrt(np.diag(A) + 1.0)
+    found = Deviations.of(A, _parts(A), 12.0, CANDIDATES).squares(scores)
     root = 1.0 / np.sqrt(np.diag(A) + 1.0)
     S, U = root[:, None] * spread * root + JITTER * np.eye(P), root[:, None] * A
     inverse = np.linalg.inv(S)
     forms = [list(h.columns) for h in CANDIDATES.hypotheses]
-    for y, row in zip(x, found, strict=True):
-        wanted = list(y**2 / np.diag(S))
+    unknown = []
+    for y, row in zip(scores * root, found, strict=True):
+        wanted = list(y**2)
         for c in forms:
             H = U[:, c].T @ inverse @ U[:, c] + np.eye(len(c)) / WIDE**2
             best = np.linalg.solve(H, U[:, c].T @ inverse @ y)
             left = y - U[:, c] @ best
             wanted.append(y @ inverse @ y - left @ inverse @ left - best @ best / WIDE**2)
+        np.testing.assert_allclose(row[: len(wanted)], wanted, rtol=1e-6, atol=1e-9)
         n = U[:, len(CANDIDATES.keys) :]
         zero = np.zeros(P)
         ratios = [normal(zero, S + s**2 * n @ n.T).pdf(y) / normal(zero, S).pdf(y) for s in UNKNOWN_SIZES]
-        wanted.append(2.0 * np.log(np.mean(ratios)))
-        np.testing.assert_allclose(row, np.maximum(wanted, 0.0), rtol=1e-6, atol=1e-9)
+        unknown.append(2.0 * np.log(ratios) - row[len(wanted) :])
+    np.testing.assert_allclose(unknown[0], unknown[1], atol=1e-6)
+
+
+def test_tails_of_deviations_are_those_of_drawn_scores() -> None:
+    """Where columns change on the judged drive and scatter is known from a few references."""
+    rng, count, A = np.random.default_rng(1), 40_000, DRIVES["other"].T @ DRIVES["other"]
+    parts = _parts(A, 0.5)
+    deviations = Deviations.of(A, parts, 6.0, CANDIDATES)
+    factors = np.ones(count), 4.0 / rng.chisquare(4, count), 6.0 / rng.chisquare(6, count)
+    scores = sum(
+        np.sqrt(f)[:, None] * rng.standard_normal((count, P)) @ np.linalg.cholesky(part).T
+        for f, part in zip(factors, parts, strict=True)
+    )
+    squares = deviations.squares(scores)
+    for k in (0, P - 1, P + 1, squares.shape[1] - 1):
+        for share in (0.1, 0.01):
+            level = np.quantile(squares[:, k], 1.0 - share) / deviations.mean[k]
+            found = np.exp(np.interp(np.log(level), np.log(GRID), deviations.log_tails[k]))
+            assert found == pytest.approx(share, rel=0.25)
+
+
+def test_a_column_that_changes_on_other_drives_does_not_hide_one_that_does_not() -> None:
+    """The other columns are as uncertain as ever, whatever the tail of this one is."""
+    changed = np.where(np.arange(P) == P - 1, 100.0, 0.0)
+    found = []
+    for seed in range(10):
+        references, runs = trial(seed, "other", effect=4.0)
+        offsets = learn_offsets(references, len(CANDIDATES.keys))
+        wide = dataclasses.replace(
+            offsets, covariance=offsets.covariance + np.diag(changed), changed=changed
+        )  # fmt: skip
+        found.append([detect(runs, robot, CANDIDATES, seed).p_value for robot in (offsets, wide)])
+    plain, beside = np.median(found, axis=0)
+    assert beside < max(3.0 * plain, 0.003)
+
+
+@pytest.mark.parametrize("scale", SCATTER_SCALES)
+def test_references_show_how_alike_runs_are(scale: float) -> None:
+    rng, robot, J = np.random.default_rng(7), np.zeros(P), 3.0 * DRIVES["reference"]
+    references = []
+    for _ in range(12):
+        error = rng.standard_normal(ROWS) + J @ (robot + scale * SCATTER * rng.standard_normal(P))
+        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+    found = np.sqrt(learn_offsets(references, len(CANDIDATES.keys)).scatter) / SCATTER
+    assert np.median(found) == pytest.approx(scale, rel=0.25)
+
+
+def test_the_likelihood_of_references_is_that_of_their_scores() -> None:
+    """But for a constant: between two scatters."""
+    from scipy.stats import multivariate_normal as normal
+
+    references, prior = trial(2, "reference")[0][:3], np.full(P, 0.7)
+    scatters = SCATTER**2, 0.1 * SCATTER**2 + 0.01
+    A = np.kron(np.eye(3), references[0].A)
+    b = np.concatenate([r.b for r in references])
+    wanted = []
+    for scatter in scatters:
+        spread = np.kron(np.ones((3, 3)), np.diag(prior)) + np.kron(np.eye(3), np.diag(scatter))
+        wanted.append(normal(np.zeros(3 * P), A @ spread @ A + A).logpdf(b))
+    found = [_log_likelihood(references, scatter, prior) for scatter in scatters]
+    assert found[1] - found[0] == pytest.approx(wanted[1] - wanted[0], rel=1e-6)
+
+
+def test_offsets_are_certain_beyond_their_noise() -> None:
+    mean, variance = np.array([1.0, -1.0, 0.5]), np.array([0.1, 0.1, 0.5])
+    robot = RobotOffsets(mean, np.diag(variance + 0.2), variance, variance, 5, changed=np.full(3, 0.2))
+    certain = np.sqrt(1.0 - 0.1 * CERTAIN)
+    np.testing.assert_allclose(robot.certain(), [certain, -certain, 0.0])
 
 
 def test_beyond_all_replicates_the_p_value_goes_on_falling() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.other_drives import detect, learn_offsets
+from terrafusion.twin.gap.infer.detection import detect
+from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null import evidence as gathering
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
