@@ -54,7 +54,7 @@ PRODUCT = (
     Study(
         "fuzz_guided",
         "Do inputs that reach new lines of the readers lead to a crash or a hang?",
-        module("fuzz_guided", "--cases", "200", "--out", OUT),
+        module("fuzz_guided", "--cases", "1000", "--out", OUT),
         5,
         {
             "cases": r"all (\d+) cases",
