@@ -67,6 +67,9 @@ def verdict_line(d: GapDiagnosis) -> str:
     if verdict.kind == "no_gap":
         if d.detection.p_value <= d.significance:
             return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
+        if d.drives is not None and d.drives.limits():
+            told = f"which cover {percent(d.drives.covered)} of the time of these drives"
+            return f"No gap as far as the references tell, {told} ({_test(d)})."
         like = "the references among themselves" if d.references else "the twin's own runs"
         return f"No gap: the runs differ no more than {like} ({_test(d)})."
     if verdict.kind == "unknown":
@@ -202,7 +205,7 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
 
 
 def _drives(d: GapDiagnosis) -> list[str]:
-    if d.drives is None or not d.drives.limits() or d.detection.p_value > d.significance:
+    if d.drives is None or not d.drives.limits():
         return []
     return [
         f"Your drives differ from your references (these cover {percent(d.drives.covered)} of the time) in: "

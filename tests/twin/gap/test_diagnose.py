@@ -207,6 +207,9 @@ def test_no_gap_on_a_clean_drive_that_no_reference_made(references: list[Recordi
     found = diagnose([run(i, drive=SLOW_TURNS) for i in (610, 611)], references, VEHICLE)
     assert found.detection.p_value > 0.05
     assert found.verdict.kind == "no_gap"
+    said = " ".join(" ".join(screen(found)).split())
+    assert said.startswith("No gap as far as the references tell, which cover ")
+    assert "Make these references" in said
 
 
 def test_undecided_where_drives_differ_and_nothing_explains_the_gap(references: list[Recording]) -> None:
