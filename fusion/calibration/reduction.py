@@ -149,14 +149,14 @@ class Reduction:
         covariance = self._solved(unit)[driving * NODE + RATIO]
         off, variance = part.state[driving, RATIO] - numbers[WHEEL_SCALE], np.diag(covariance)
         begin = np.flatnonzero(np.diff(driving) == 1)
-        told = np.clip(1.0 - variance / self.spread**2, 0.0, 1.0)
-        told = told[begin] * told[begin + 1]
+        known = np.clip(1.0 - variance / self.spread**2, 0.0, 1.0)
+        known = known[begin] * known[begin + 1]
         return SlipMoments(
             nodes=len(driving),
             squares=float((off**2 + variance).sum()),
             products=float((off[begin] * off[begin + 1] + covariance[begin, begin + 1]).sum()),
-            told=float(told.sum()),
-            apart_s=float(told @ np.diff(drive.t_s[drive.first])[driving[begin]]),
+            known=float(known.sum()),
+            apart_s=float(known @ np.diff(drive.t_s[drive.first])[driving[begin]]),
         )
 
     def _assemble_links(self) -> None:

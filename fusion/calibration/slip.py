@@ -27,14 +27,14 @@ class SlipMoments:
         nodes: their number.
         squares: of the expected squares of the ratios about the wheel scale.
         products: of the expected products of neighbours.
-        told: of the products' shares that fixes tell, g g'.
+        known: of the shares g g' of the products that fixes determine.
         apart_s: of the times between neighbours, by these shares.
     """
 
     nodes: int
     squares: float
     products: float
-    told: float
+    known: float
     apart_s: float
 
 
@@ -44,12 +44,12 @@ def slip_process(
     """Spread and correlation time, s, of slip; the time is at most the one assumed."""
     nodes = PRIOR_NODES + sum(m.nodes for m in moments)
     spread = math.sqrt((PRIOR_NODES * assumed_spread**2 + sum(m.squares for m in moments)) / nodes)
-    spread, told = max(spread, LEAST_SPREAD), sum(m.told for m in moments)
-    if told <= 0.0:
+    spread, known = max(spread, LEAST_SPREAD), sum(m.known for m in moments)
+    if known <= 0.0:
         return spread, assumed_time_s
-    apart_s = sum(m.apart_s for m in moments) / told
+    apart_s = sum(m.apart_s for m in moments) / known
     assumed = math.exp(-apart_s / assumed_time_s)
     seen = sum(m.products for m in moments) / spread**2
-    correlation = (PRIOR_PAIRS * assumed + seen) / (PRIOR_PAIRS + told)
+    correlation = (PRIOR_PAIRS * assumed + seen) / (PRIOR_PAIRS + known)
     least = math.exp(-1.0 / LEAST_NODE_SHARE)
     return spread, -apart_s / math.log(min(max(correlation, least), assumed))

@@ -60,9 +60,9 @@ def write_diagnosis(
 def _value(d: GapDiagnosis) -> str:
     if d.verdict.kind == "unknown":
         return "not_to_be_used"
-    told = d.drives is None or not d.drives.limits()
+    covered = d.drives is None or not d.drives.limits()
     alike = d.verdict.kind == "no_gap" and d.detection.p_value > d.significance
-    return "good" if alike and told else "doubtful"
+    return "good" if alike and covered else "doubtful"
 
 
 def _tiles(d: GapDiagnosis) -> list[Tile]:

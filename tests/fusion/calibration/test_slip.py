@@ -64,7 +64,7 @@ def test_without_neighbours_both_are_as_assumed() -> None:
 
 
 def test_the_correlation_is_that_of_the_prior_and_of_what_is_told_by_hand() -> None:
-    moments = SlipMoments(nodes=9, squares=9 * 0.04, products=8 * 0.02, told=8.0, apart_s=40.0)
+    moments = SlipMoments(nodes=9, squares=9 * 0.04, products=8 * 0.02, known=8.0, apart_s=40.0)
     spread, time_s = slip_process([moments], 0.2, 50.0)
     assert spread == pytest.approx(0.2)
     expected = (PRIOR_PAIRS * math.exp(-5.0 / 50.0) + 8 * 0.02 / 0.04) / (PRIOR_PAIRS + 8.0)
