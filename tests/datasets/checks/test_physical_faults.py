@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.channels import Command, Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.recording import Overrides, Recording
-from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.datasets.core.sensors import Rig, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
@@ -392,19 +390,6 @@ def test_what_the_data_leave_open_is_found_and_left(name: str) -> None:
     assert found[code].repair is None
     _, done = repair(corrupted)
     assert code not in [finding.code for finding in done]
-
-
-@pytest.mark.parametrize("angles_rad", [(0.0, 0.0, 0.5 * np.pi), (0.0, 0.0, -0.4), (0.7, -0.2, 0.0)])
-def test_an_imu_mounted_as_the_vehicle_file_says_is_no_finding(
-    angles_rad: tuple[float, ...], husky_rig: Rig
-) -> None:
-    R = Rotation.from_euler("xyz", angles_rad).as_matrix()
-    log = imu_with(gyro_radps=lambda g: g @ R, accel_mps2=lambda a: a @ R)(lively_drive())
-    rig = dataclasses.replace(husky_rig, wheel_radius_m=RADIUS_M, sensors=level(husky_rig))
-    assert {finding.channel for finding in run_checks(log, rig)} == {"imu"}
-    names = ("imu_roll_rad", "imu_pitch_rad", "imu_yaw_rad")
-    known = {name: KnownNumber(a, "measured") for name, a in zip(names, angles_rad, strict=True)}
-    assert run_checks(log, dataclasses.replace(rig, known=SensorNumbers(**known))) == []
 
 
 def test_slip_on_soft_ground_is_no_finding() -> None:

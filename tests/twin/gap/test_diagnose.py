@@ -10,7 +10,6 @@ import jsonschema
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.fusion.reports.gap_text import answer as screen
 from terrafusion.fusion.reports.plots.gap import plot_shrink
@@ -448,18 +447,3 @@ def test_sigma_covers_a_delay_on_top_of_one_that_references_have(first: int) -> 
     assert answer["named"] == ["imu_time_offset"]
     number = answer["causes"][0]["parameters"]["imu_time_offset/shift"]
     assert abs(number["value"] - 0.06) < 2.0 * number["sigma"] < 0.04
-
-
-def test_nonsense_is_refused(references: list[Recording]) -> None:
-    with pytest.raises(DataError, match="no run"):
-        diagnose([], references, VEHICLE)
-    renamed = dataclasses.replace(references[0], name="again")
-    with pytest.raises(DataError, match="again: the same log as run100; give each once"):
-        diagnose(references[:1], [renamed, *references[1:]], VEHICLE)
-    assert references[0].motor is not None
-    motor = dataclasses.replace(references[0].motor, current_a=references[0].motor.current_a + 1.0)
-    assert diagnose(references[:1], [dataclasses.replace(renamed, motor=motor)], VEHICLE).references
-    with pytest.raises(ConfigError, match="unknown effect"):
-        diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
-    with pytest.raises(ConfigError, match="significance"):
-        diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)

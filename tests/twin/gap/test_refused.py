@@ -1,0 +1,34 @@
+"""What a diagnosis refuses, in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.gap.diagnose import diagnose
+from tests.twin.gap.runs import runs
+from tests.twin.gap.test_diagnose import VEHICLE
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Recording]:
+    return runs(100, 6)
+
+
+def test_nonsense_is_refused(references: list[Recording]) -> None:
+    with pytest.raises(DataError, match="no run"):
+        diagnose([], references, VEHICLE)
+    renamed = dataclasses.replace(references[0], name="again")
+    with pytest.raises(DataError, match="again: the same log as run100; give each once"):
+        diagnose(references[:1], [renamed, *references[1:]], VEHICLE)
+    assert references[0].motor is not None
+    motor = dataclasses.replace(references[0].motor, current_a=references[0].motor.current_a + 1.0)
+    assert diagnose(references[:1], [dataclasses.replace(renamed, motor=motor)], VEHICLE).references
+    with pytest.raises(ConfigError, match="unknown effect"):
+        diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
+    with pytest.raises(ConfigError, match="significance"):
+        diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)
