@@ -157,10 +157,14 @@ class _Folder:
         return plain if plain.exists() else packed if packed.exists() else None
 
     def unknown_files(self) -> Iterator[str]:
-        """A note for each CSV that is no channel: a misspelt name would otherwise go unseen."""
+        """A note for each CSV that is no channel, and each channel that is no CSV: they are not read."""
         for path in sorted(self.folder.iterdir()):
             stem = path.name.removesuffix(".gz").removesuffix(".csv")
-            if stem == path.name or not path.name.endswith((".csv", ".csv.gz")) or stem in CHANNELS:
+            if stem == path.name or not path.name.endswith((".csv", ".csv.gz")):
+                if path.stem in CHANNELS and path.is_file():
+                    yield f"{path.name} was not read: a log folder has {path.stem}.csv or {path.stem}.csv.gz"
+                continue
+            if stem in CHANNELS:
                 continue
             close = difflib.get_close_matches(stem, CHANNELS, n=1)
             meant = f" (did you mean {close[0]}.csv?)" if close else ""

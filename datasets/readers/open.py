@@ -13,6 +13,8 @@ from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers.formats import Format, Request, format_of
 
 STAMPS = ("header", "receipt")
+NOT_USED = "not used here"
+"""How a note ends on an option that means nothing for the format of a log."""
 
 
 def open_recordings(
@@ -160,7 +162,7 @@ def _unused(form: Format, request: Request) -> list[str]:
     bag = form.name in ("ros1", "ros2")
     used = {"topics": request.topics, "stamps": request.stamps != "header"}
     given = [] if bag else [word for word, value in used.items() if value]
-    notes = [f"{' and '.join(given)} only matter for ROS bags; not used here"] if given else []
+    notes = [f"{' and '.join(given)} only matter for ROS bags; {NOT_USED}"] if given else []
     if request.columns is not None and form.name != "table":
-        notes.append("columns only matter for plain tables; not used here")
+        notes.append(f"columns only matter for plain tables; {NOT_USED}")
     return notes

@@ -130,6 +130,7 @@ class HowRead:
         from terrafusion.datasets.readers import open_recording
 
         recording = open_recording(log, **self.options(rig))
+        warn_unused(log, [recording])
         return clock_accepted(recording) if self.repair_clock else recording
 
     def open_all(self, names: Sequence[str], rig: Rig | None) -> list[Recording]:
@@ -141,9 +142,20 @@ class HowRead:
         found: list[Recording] = []
         for name in names:
             log, cut = split_name(name)
-            for recording in open_recordings(log, **options):
+            read = open_recordings(log, **options)
+            warn_unused(log, read)
+            for recording in read:
                 found += [recording] if cut is None else cut.of(recording)
         return [clock_accepted(r) for r in found] if self.repair_clock else found
+
+
+def warn_unused(log: str, recordings: Sequence[Recording]) -> None:
+    """A line on standard error for each option that means nothing for the format of a log."""
+    from terrafusion.datasets.readers import NOT_USED
+
+    for note in recordings[0].notes if recordings else ():
+        if note.endswith(NOT_USED):
+            print(f"warning: {log}: {note}", file=sys.stderr)
 
 
 def clock_accepted(recording: Recording) -> Recording:

@@ -17,6 +17,7 @@ from terrafusion.fusion.cli.common import (
     load_rig,
     refuse_impossible,
     rig_of,
+    warn_unused,
 )
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
@@ -58,6 +59,7 @@ def convert(
 
     rig = load_rig(vehicle)
     recording = open_recording(log, **replace(how, repair_clock=how.repair_clock or apply_fixes).options(rig))
+    warn_unused(log, [recording])
     if how.repair_clock:
         recording = clock_accepted(recording)
     rig = rig_of(recording, rig)

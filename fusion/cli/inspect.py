@@ -17,6 +17,7 @@ from terrafusion.fusion.cli.common import (
     command_line,
     load_rig,
     rig_of,
+    warn_unused,
 )
 from terrafusion.fusion.cli.inspect_page import Line
 
@@ -91,6 +92,7 @@ def inspected(
 
     rig = load_rig(vehicle)
     recordings = open_recordings(log, **HowRead(topic, stamps, columns, True).options(rig))
+    warn_unused(log, recordings)
     findings = [run_checks(recording, rig_of(recording, rig)) for recording in recordings]
     measures = measure(recordings, rig_of(recordings[0], rig))
     if len(recordings) == 1:

@@ -58,10 +58,16 @@ TARGETS = {
         f"{MODES}test_a_robot_the_model_does_not_know_has_the_pooled_noise_until_evidence_comes",
         f"{MODES}test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot",
     ),
+    "fusion/calibration/slip.py": ("tests/fusion/calibration/test_slip.py",),
+    "fusion/estimator/learned_numbers.py": (
+        "tests/fusion/estimator/test_learned_doubt.py",
+        "tests/fusion/outputs/test_learned_numbers.py",
+    ),
     "fusion/inputs/door.py": ("tests/fusion/inputs/test_door.py",),
     "fusion/inputs/gyro_unit.py": ("tests/fusion/inputs/test_gyro_unit.py",),
     "twin/gap/infer/single_effects.py": ("tests/twin/gap/infer/test_single_effects.py",),
     "twin/gap/infer/predictive.py": ("tests/twin/gap/infer/test_predictive.py",),
+    "twin/gap/infer/detection.py": ("tests/twin/gap/infer/test_other_drives.py",),
     "twin/gap/infer/other_drives.py": ("tests/twin/gap/infer/test_other_drives.py",),
 }  # fmt: skip
 LONGEST_CPU_S, LONGEST_S = 120.0, 900.0

@@ -106,6 +106,14 @@ def test_misspelt_channel_file_is_noted(tmp_path: Path) -> None:
     assert any("wheel.csv" in note and "wheels.csv" in note for note in recording.notes)
 
 
+def test_a_channel_in_another_format_beside_the_csv_is_noted(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, imu="t_s,gyro_z_radps\n0,0.1\n")
+    (folder / "imu.parquet").write_bytes(b"PAR1")
+    (folder / "photo.parquet").write_bytes(b"PAR1")
+    notes = [note for note in open_recording(folder).notes if "parquet" in note]
+    assert notes == ["imu.parquet was not read: a log folder has imu.csv or imu.csv.gz"]
+
+
 def test_unknown_keys_of_meta_are_kept_and_named_in_one_warning(tmp_path: Path) -> None:
     meta = META + "operator: A. Smith\nweather: {sky: grey, rain: .nan}\nwheel_radus: 0.2\n"
     recording = open_recording(folder_with(tmp_path, meta, imu="t_s,gyro_z_radps\n0,0.1\n"))

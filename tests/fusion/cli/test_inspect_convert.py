@@ -51,6 +51,25 @@ def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, st
     return status, out, err
 
 
+@pytest.mark.parametrize(
+    "command", [("inspect", "LOG"), ("convert", "LOG", "OUT"), ("calibrate", "LOG", "--sensors")]
+)
+def test_options_that_a_log_folder_has_no_use_for_are_warned_of(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    columns = tmp_path / "map.yaml"
+    columns.write_text("time: t\n")
+    words = [{"LOG": str(log), "OUT": str(tmp_path / "out")}.get(word, word) for word in command]
+    _, _, err = run(capsys, *words, "--topic", "imu=/imu", "--columns", columns)
+    warned = [line for line in err.splitlines() if line.startswith("warning: ")]
+    assert warned == [
+        f"warning: {log}: topics only matter for ROS bags; not used here",
+        f"warning: {log}: columns only matter for plain tables; not used here",
+    ]
+    _, _, err = run(capsys, *words)
+    assert "warning" not in err
+
+
 def test_inspect_page(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, "inspect", log)
     assert (status, err) == (0, "")
