@@ -18,6 +18,8 @@ DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").
 
 SLOW = ("terrain train", "terrain eval", "policy fit")
 """Commands that take longer than a test should: only their options are checked."""
+FEWER = {"demo": ["--drives", "2"]}
+"""Commands that are run with less work than they do by default."""
 
 
 def blocks(document: Path) -> Iterator[tuple[int, str, str]]:
@@ -32,6 +34,7 @@ def run_command(line: str) -> str:
     assert name == "terrafusion", line
     if " ".join(arguments[:2]) in SLOW:
         arguments.append("--help")
+    arguments += FEWER.get(arguments[0], [])
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, f"{line}\n{result.output}"
     return result.output

@@ -13,8 +13,8 @@ from terrafusion.fusion.benchmark.compare import contrasts, median_interval, sha
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run_score import GroundScore, RunScore, switch_delay_s
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, pooled_nees, targets
+from terrafusion.fusion.reports.benchmark import plot_ratios
 from terrafusion.fusion.reports.benchmark_tables import tables
-from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 from terrafusion.fusion.reports.plots.sheet import Sheet
 
 

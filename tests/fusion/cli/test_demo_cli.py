@@ -100,6 +100,6 @@ def test_its_log_can_be_read_again(demo: tuple[Path, str]) -> None:
 def test_it_runs_twice_into_the_same_folder(demo: tuple[Path, str], terrafusion) -> None:
     folder, _ = demo
     before = (folder / "fixed" / "estimate.csv").read_bytes()
-    outcome = terrafusion("demo", "--out", folder, "--drives", "1")
+    outcome = terrafusion("demo", "--out", folder, "--drives", "1", "--jobs", "1")
     assert (outcome.status, outcome.err) == (0, "")
     assert (folder / "fixed" / "estimate.csv").read_bytes() == before

@@ -41,9 +41,7 @@ from terrafusion.fusion.training.surface_features import (
 )
 from terrafusion.fusion.training.surface_report import (
     figures_lines,
-    leaking,
     lines_of,
-    never_seen,
     report_on,
     score,
     transfer,
@@ -290,8 +288,8 @@ def test_the_report_of_made_drives(runs: Sequence[LabelledRun]) -> None:
     text = "\n".join(lines_of(report))
     assert "macro-F1" in text
     assert "gravel" in text
-    assert leaking(short)["softmax"] > 0.9
-    assert set(never_seen(short)) == set(SHAKES)
+    assert report["reference"]["split that leaks"]["softmax"] > 0.9
+    assert set(report["ground never seen"]) == set(SHAKES)
     assert transfer(short, short[:6])["common grounds"] == ["gravel"]
 
 

@@ -77,10 +77,14 @@ def test_a_refused_address_is_reported_within_ten_seconds(tmp_path: Path) -> Non
     _fails_fast(tmp_path, f"tcp://127.0.0.1:{port}", "no Dask scheduler answers .*refused.*dask scheduler")
 
 
-def test_a_silent_address_is_reported_within_ten_seconds(tmp_path: Path) -> None:
+def test_a_silent_address_is_reported_within_ten_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert executors.CONNECT_S <= 8.0  # leaves the other two
+    monkeypatch.setattr(executors, "CONNECT_S", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
-        _fails_fast(tmp_path, f"tcp://127.0.0.1:{port}", "no Dask scheduler answers .*timed out")
+        _fails_fast(tmp_path, f"tcp://127.0.0.1:{port}", "no Dask scheduler answers .*timed out", 3.0)
 
 
 def test_another_kind_of_server_is_reported_as_such(tmp_path: Path) -> None:
@@ -176,8 +180,8 @@ def test_a_lost_scheduler_is_reported(tmp_path: Path) -> None:
         assert time.monotonic() - begun < 30.0
 
 
-def _fails_fast(folder: Path, address: str, words: str) -> None:
+def _fails_fast(folder: Path, address: str, words: str, within_s: float = 10.0) -> None:
     begun = time.monotonic()
     with pytest.raises(TerrafusionError, match=words):
         run_sweep(sweep_of(folder), folder / "out", backend="dask", address=address)
-    assert time.monotonic() - begun < 10.0
+    assert time.monotonic() - begun < within_s

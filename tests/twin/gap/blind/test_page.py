@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from terrafusion.fusion.reports.blind import summary, write_blind
-from terrafusion.fusion.reports.plots import blind as plots
+from terrafusion.fusion.reports.blind import draw, summary, write_blind
 from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.twin.gap.blind.plan import FULL, CheckSize, plan
 from terrafusion.twin.gap.blind.score import score
@@ -50,7 +49,7 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
     )
     assert sum(line.endswith("met") for line in told) >= 12
     sheet = Sheet()
-    plots.draw(sheet, scores)
+    draw(sheet, scores)
     assert set(sheet.panels["power"].legend) == {"diagnosis", "opponent"}
     assert "0 of 200 (0.00 to 0.02)" in sheet.json()
 
