@@ -56,6 +56,7 @@ from terrafusion.fusion.graph.planar import (
 )
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
+from terrafusion.fusion.inputs.leaps import FixesAhead
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import (
     LONGEST_PAUSE_NS,
@@ -107,9 +108,9 @@ class Estimator:
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
-        self.wheels, self.steering = WheelStream(self.newest), SteeringStream(rig, self.newest)
+        self.wheels, self.fixes_ahead = WheelStream(self.newest), FixesAhead(self.newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
-        self._turn = steered_turn(rig, config.inputs)
+        self.steering, self._turn = SteeringStream(rig, self.newest), steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
@@ -180,10 +181,9 @@ class Estimator:
 
         `fix` is the class of fix ("single" to "fixed"); it gives the sigma where none is sensible.
         """
-        taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
-        if taken is not None and self.newest.admitted(taken.t_ns, "gnss") is not None:
-            self.gnss.queue(taken)
-            self.learned.fix(taken)
+        checked = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
+        for one in self.fixes_ahead.admitted(checked):
+            self.gnss.queue(one), self.learned.fix(one)
 
     def set_start(
         self,

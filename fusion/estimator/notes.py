@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.inputs.door import LEAP_NS, MOST_MPS, MOST_MPS2, MOST_RADPS
+from terrafusion.fusion.inputs.door import MOST_MPS, MOST_MPS2, MOST_RADPS
+from terrafusion.fusion.inputs.leaps import LEAP_NS
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 
 
@@ -59,6 +60,11 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         )
     for channel, ahead in estimator.newest.refused.items():
         notes.append(f"{ahead} samples of {channel} lay far ahead of IMU and wheels: they were left out")
+    if dropped := estimator.fixes_ahead.dropped:
+        notes.append(
+            f"{dropped} GNSS fixes lay more than {LEAP_NS * 1e-9:g} s ahead of IMU and wheels, and "
+            "of fixes that came after them: they were left out"
+        )
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.leap.dropped:
             notes.append(

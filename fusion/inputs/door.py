@@ -5,8 +5,7 @@ goes on with the next. Numbers that no ground robot has are left out and counted
 no run.
 """
 
-from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,13 +25,6 @@ MOST_AWAY_M, MOST_HEIGHT_M = 2e7, 1e5
 LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
 """Reported sigmas outside this range are replaced by that of the class of fix; without a class the smaller
 ones are raised to it."""
-LEAP_NS, LONGEST_LEAP_NS, LEAP_STEPS = 1_000_000_000, 10_000_000_000, 10
-"""A sample this much newer than all others, and by so many of the steps before, is no next sample, unless
-others confirm its time; beyond the longest always."""
-STEPS_SEEN = 8
-CONFIRMED, CONFIRMED_NS = 3, 500_000_000
-"""Samples that show that time has leapt, and the time that they must span: in it another stream that goes on
-would have shown that it has not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,93 +40,6 @@ class GnssFix:
     velocity_mps: Array | None = None
     sigma_v_mps: float = float("nan")
     fix: Fix | None = None
-
-
-@dataclass
-class Newest:
-    """Time of the newest sample of IMU and wheels; None before the first.
-
-    `refused` counts, by channel, samples far ahead of it; `steps_ns` has the last steps of time; `taken`
-    counts the samples that are used.
-    """
-
-    t_ns: int | None = None
-    refused: dict[str, int] = field(default_factory=dict)
-    steps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
-    taken: int = 0
-
-    def advance(self, t_ns: int) -> None:
-        """Take the time of a sample that is used."""
-        self.taken += 1
-        if self.t_ns is None or t_ns > self.t_ns:
-            if self.t_ns is not None:
-                self.steps_ns.append(t_ns - self.t_ns)
-            self.t_ns = t_ns
-
-    def leaps(self, t_ns: int) -> bool:
-        """Whether a time lies far ahead of all samples."""
-        return self.t_ns is not None and t_ns - self.t_ns > LEAP_NS and t_ns - self.t_ns > self.leap_ns()
-
-    def leap_ns(self) -> int:
-        """Step of time that is a leap."""
-        if len(self.steps_ns) < STEPS_SEEN:
-            return LONGEST_LEAP_NS
-        return min(max(LEAP_NS, LEAP_STEPS * max(self.steps_ns)), LONGEST_LEAP_NS)
-
-    def admitted(self, t_ns: Any, channel: str) -> int | None:
-        """The time of a sample of another channel, ns; None, and counted, where it lies far ahead.
-
-        Raises:
-            DataError: the time is none.
-        """
-        t_ns = checked_time(t_ns, channel)
-        if self.t_ns is None or t_ns - self.t_ns <= LONGEST_LEAP_NS:
-            return t_ns
-        self.refused[channel] = self.refused.get(channel, 0) + 1
-        return None
-
-
-@dataclass
-class Leap:
-    """Samples far ahead of all others; they distinguish a clock that was wrong once from a pause of the log.
-
-    Attributes:
-        newest: of all streams.
-        held: samples ahead, each beginning with its time.
-        taken: samples that had been used when the first of `held` came.
-        dropped: number of samples whose time no other confirmed, or another stream contradicted.
-    """
-
-    newest: Newest
-    held: list[tuple[Any, ...]] = field(default_factory=list)
-    taken: int = 0
-    dropped: int = 0
-
-    def admitted(self, sample: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-        """The samples to use now: this one, none while it leaps ahead, or all held once they agree."""
-        t_ns, before = sample[0], []
-        if self.held and not self.newest.leaps(self.held[-1][0]):  # another stream has confirmed them
-            before = self.held[:]
-            self.held.clear()
-        if self.held and not (
-            self.newest.leaps(t_ns)
-            and abs(t_ns - self.held[-1][0]) <= self.newest.leap_ns()
-            and self.newest.taken == self.taken  # else another stream goes on as before
-        ):
-            self.dropped += len(self.held)
-            self.held.clear()
-        samples = [*before, sample]
-        if self.newest.leaps(t_ns):
-            self.taken = self.newest.taken
-            self.held.append(sample)
-            span_ns = abs(t_ns - self.held[0][0])
-            if len(self.held) < CONFIRMED or span_ns < CONFIRMED_NS:
-                return []
-            samples = sorted(self.held, key=lambda one: one[0])
-            self.held.clear()
-        for one in samples:
-            self.newest.advance(one[0])
-        return samples
 
 
 def checked_time(t_ns: Any, channel: str) -> int:

@@ -13,13 +13,10 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
 from terrafusion.fusion.inputs.door import (
-    CONFIRMED,
     MOST_MPS,
     MOST_MPS2,
     MOST_RADPS,
     MOST_TRAVEL_M,
-    Leap,
-    Newest,
     as_number,
     as_numbers,
     beyond,
@@ -28,6 +25,7 @@ from terrafusion.fusion.inputs.door import (
 from terrafusion.fusion.inputs.door import (
     GnssFix as GnssFix,
 )
+from terrafusion.fusion.inputs.leaps import CONFIRMED, LEAP_NS, Leap, Newest
 
 
 @dataclass(eq=False)
@@ -101,7 +99,7 @@ class Lateness:
 
     def __init__(self, channel: str, newest: Newest | None = None) -> None:
         self.channel = channel
-        self.leap = Leap(newest or Newest())
+        self.leap = Leap(newest or Newest(), channel)
         self.wait_ns = 0
         self.used_ns: int | None = None
         self.too_late = 0
@@ -109,7 +107,7 @@ class Lateness:
     def from_future(self, t_ns: int, times: list[int]) -> int:
         """How many of the newest samples, fewer than show a leap, have times that were wrong; before the
         start only."""
-        ahead = len(times) - bisect.bisect_right(times, t_ns + round(MOST_LATE_S * 1e9))
+        ahead = len(times) - bisect.bisect_right(times, t_ns + LEAP_NS)
         if self.used_ns is not None or not 0 < ahead < CONFIRMED:
             return 0
         self.leap.dropped += ahead

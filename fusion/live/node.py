@@ -34,7 +34,8 @@ from terrafusion.datasets.readers.ros.static_frames import STATIC, StaticFrames
 from terrafusion.fusion.estimate.estimate import STATUS, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.inputs.door import CONFIRMED, MOST_HEIGHT_M, Leap, Newest
+from terrafusion.fusion.inputs.door import MOST_HEIGHT_M
+from terrafusion.fusion.inputs.leaps import CONFIRMED, CONFIRMED_NS, LEAP_NS, FixesAhead, Leap, Newest
 from terrafusion.fusion.inputs.streams import MOST_LATE_S
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.loop import live_estimator
@@ -215,6 +216,9 @@ class LiveNode:
     def _begin_ordering(self) -> None:
         self._ordered = OrderedSamples("imu", self.options.wait_s)
         self._leap, self._back = Leap(Newest()), 0
+        self._fixes_ahead = FixesAhead(self._leap.newest)
+        self._received_ns = 0
+        self._ahead_ns: int | None = None
         self._published_ns: int | None = None
         self._keyframe: State | None = None
 
@@ -272,13 +276,18 @@ class LiveNode:
             self._refuse(message.topic, error)
             return
         for t_ns, kind, sample in samples:
-            self._order(t_ns, kind, sample)
+            self._order(t_ns, kind, sample, message.receipt_ns)
 
-    def _order(self, t_ns: int, kind: str, sample: Any) -> None:
+    def _order(self, t_ns: int, kind: str, sample: Any, receipt_ns: int) -> None:
         newest_ns = self._leap.newest.t_ns
+        if kind == "gnss":
+            for one in self._fixes_ahead.in_order(t_ns, sample):
+                self._ordered.add(one[0], kind, one[1])
+            return
         if kind != "imu":
             if kind == "wheels" and not self._leap.newest.leaps(t_ns):
                 self._leap.newest.taken += 1  # an IMU that leaps alone is not followed
+                self._ahead_ns = None
             self._ordered.add(t_ns, kind, sample)
             return
         if newest_ns is not None and newest_ns - t_ns > MOST_LATE_S * 1e9:
@@ -288,8 +297,23 @@ class LiveNode:
                 return
             self.reset(f"the stamps of the IMU went back by {(newest_ns - t_ns) * 1e-9:.1f} s")
         self._back = 0
+        if self._is_ahead(t_ns, receipt_ns):
+            self.counts["refused"] += 1
+            return
         for one in self._leap.admitted((t_ns, sample)):
             self._ordered.add(one[0], kind, one[1])
+
+    def _is_ahead(self, t_ns: int, receipt_ns: int) -> bool:
+        """Whether the stamps of the IMU leap without a pause in the messages; begins anew where they stay."""
+        newest_ns = self._leap.newest.t_ns
+        if newest_ns is not None and t_ns - newest_ns > receipt_ns - self._received_ns + LEAP_NS:
+            if self._ahead_ns is None:
+                self._ahead_ns = t_ns
+            if t_ns - self._ahead_ns < CONFIRMED_NS:
+                return True
+            self.reset(f"the stamps of the IMU went ahead by {(t_ns - newest_ns) * 1e-9:.1f} s")
+        self._received_ns, self._ahead_ns = receipt_ns, None
+        return False
 
     def _use(self, samples: Iterable[Any]) -> None:
         for sample in samples:

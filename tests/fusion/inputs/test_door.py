@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import re
 import time
 from typing import Any
 
@@ -13,10 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import ImuSample, Message, WheelSample
+from terrafusion.datasets.core.messages import GnssSample, ImuSample, Message, WheelSample
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.notes import notes_of
-from terrafusion.fusion.inputs.door import Leap, Newest, checked_fix, checked_time
+from terrafusion.fusion.inputs.door import checked_fix, checked_time
+from terrafusion.fusion.inputs.leaps import Leap, Newest
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
@@ -125,6 +127,102 @@ def test_a_clock_that_leaps_for_a_while_is_not_followed_while_the_other_goes_on(
     assert any("ahead of all others" in note for note in notes_of(estimator))
 
 
+@pytest.mark.parametrize("back", [True, False])
+@pytest.mark.parametrize("ahead_ns", [4 * 10**9, HOUR_NS])
+def test_clocks_that_leap_together_are_not_followed_while_the_fixes_go_on(
+    running: Running, ahead_ns: int, back: bool
+) -> None:
+    """As after a step of the clock of the computer: for a second, or for good."""
+    estimator, until_ns = running.again(), running.now_ns + (10**9 if back else HOUR_NS)
+    for message in running.rest:
+        leaps = isinstance(message, (ImuSample, WheelSample)) and message.t_ns < until_ns
+        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if leaps else message)
+    state = estimator.latest()
+    assert state is not None
+    if back:
+        assert np.linalg.norm(state.position_m - running.end_m) < 0.1
+    else:
+        assert state.t_ns <= running.now_ns
+    assert any("samples of imu lay more than 1 s ahead" in note for note in notes_of(estimator))
+
+
+def test_clocks_that_stay_ahead_of_the_fixes_are_an_error(running: Running) -> None:
+    estimator, refused = running.again(), []
+    for i, (message, again) in enumerate([(m, k) for k in range(4) for m in running.rest]):
+        later_ns = again * (running.rest[-1].t_ns - running.now_ns)
+        leaps = isinstance(message, (ImuSample, WheelSample))
+        try:
+            estimator.add(message._replace(t_ns=message.t_ns + later_ns + leaps * HOUR_NS))
+        except DataError as error:
+            refused.append((i, str(error)))
+    assert refused
+    assert refused[0][0] > len(running.rest), "not at once: it may come back"
+    assert re.search(r"360\d\.\d s ahead of the fixes, .* start anew", refused[0][1])
+
+
+@pytest.mark.parametrize("fixes", ["leap, too", "are missing"])
+def test_clocks_that_leap_together_are_followed_where_no_fix_contradicts(
+    running: Running, fixes: str
+) -> None:
+    estimator = running.again()
+    for message in running.rest:
+        if fixes == "leap, too" or not isinstance(message, GnssSample):
+            estimator.add(message._replace(t_ns=message.t_ns + HOUR_NS))
+    state = estimator.latest()
+    assert state is not None
+    assert state.t_ns > running.now_ns + HOUR_NS
+
+
+@pytest.mark.parametrize("ahead_s", [1.5, 4.0, 9.0])
+def test_a_fix_with_a_stamp_some_seconds_ahead_is_left_out(running: Running, ahead_s: float) -> None:
+    """It would be used as soon as the robot is there in time, and believed where sigma has grown."""
+    estimator, plain = running.again(), running.again()
+    ahead_ns = running.now_ns + round(ahead_s * 1e9)
+    fixes = iter([m for m in running.rest if isinstance(m, GnssSample)][:1])
+    for message in running.rest:
+        if isinstance(message, GnssSample):  # an outage but for one fix
+            message = next(fixes, None)
+            if message is not None:
+                estimator.add(message._replace(t_ns=ahead_ns))
+                estimator.add(message)
+                plain.add(message)
+            continue
+        estimator.add(message)
+        plain.add(message)
+    a, b = estimator.latest(), plain.latest()
+    assert a is not None
+    assert b is not None
+    np.testing.assert_array_equal(a.position_m, b.position_m)
+    assert any(note.startswith("1 GNSS fixes lay more than 1 s ahead") for note in notes_of(estimator))
+
+
+def test_fixes_of_a_receiver_whose_clock_is_ahead_are_used(running: Running) -> None:
+    estimator, count = running.again(), 0
+    for message in running.rest:
+        if isinstance(message, GnssSample):
+            message = message._replace(t_ns=message.t_ns + 15 * 10**8)
+            count += 1
+        estimator.add(message)
+    assert count > 5
+    assert estimator.fixes_ahead.dropped == 0
+    assert len(estimator.fixes_ahead.held) < 3
+
+
+@pytest.mark.parametrize("wrong", [1, 3, 7])
+def test_a_wrong_stamp_among_the_first_opens_the_door_to_no_other(wrong: int) -> None:
+    """Until some steps of time are known, any would do: one that is wrong would permit all after it."""
+    wheels = WheelStream()
+    imu = ImuStream(newest=wheels.late.leap.newest)
+    for i in range(400):
+        ahead_ns = 2_640_000_000 if i == wrong or i % 100 == 50 else 0
+        imu.add(i * 10**7 + ahead_ns, np.zeros(3), G)
+        if i % 2 == 0:
+            wheels.add(i * 10**7, 1.0, 1.0)
+    assert imu.late.leap.dropped == 5
+    assert imu.t_ns == [i * 10**7 for i in range(400) if i != wrong and i % 100 != 50]
+    assert len(wheels.t_ns) == 200
+
+
 @pytest.mark.parametrize("ahead_s", [1.5, 4.0, 6.0, 9.0])
 @pytest.mark.parametrize("channel", ["imu", "wheels"])
 def test_a_stamp_some_seconds_ahead_costs_nothing(running: Running, channel: str, ahead_s: float) -> None:
@@ -144,9 +242,12 @@ def test_one_sample_that_is_seconds_old_delays_nothing(running: Running) -> None
 
 
 def test_a_slow_stream_has_no_leaps() -> None:
-    """Samples 2 s apart, as of the only sensor of a log, are each used when they come."""
+    """Of samples 2 s apart, as of the only sensor of a log, none is lost, and few wait for another."""
     leap = Leap(Newest())
-    assert all(leap.admitted((i * 2 * 10**9,)) for i in range(30))
+    admitted = [leap.admitted((i * 2 * 10**9,)) for i in range(30)]
+    assert [len(some) for some in admitted[:4]] == [1, 0, 0, 3]
+    assert sum(map(len, admitted)) == 30
+    assert leap.dropped == 0
 
 
 def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_it(running: Running) -> None:
@@ -166,10 +267,11 @@ def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_i
     assert estimator.latest().covariance[0, 0] < 0.1, "the fixes place it again"  # type: ignore[union-attr]
 
 
-def test_a_first_stamp_that_was_wrong_does_not_lock_a_stream() -> None:
+@pytest.mark.parametrize("ahead_ns", [2 * 10**9, 10 * HOUR_NS])
+def test_a_first_stamp_that_was_wrong_does_not_lock_a_stream(ahead_ns: int) -> None:
     wheels, imu = WheelStream(), ImuStream()
-    wheels.add(10 * HOUR_NS, 1.0, 1.0)
-    imu.add(10 * HOUR_NS, np.zeros(3), G)
+    wheels.add(ahead_ns, 1.0, 1.0)
+    imu.add(ahead_ns, np.zeros(3), G)
     for i in range(5):
         wheels.add(i * 10**8, 1.0, 1.0)
         imu.add(i * 10**8, np.zeros(3), G)

@@ -211,6 +211,34 @@ def test_a_bag_that_starts_again_starts_the_estimator_anew(messages: list[BagMes
     assert abs(times[again + 1] - times[0]) < 200_000_000
 
 
+def ahead(message: BagMessage, seconds: int) -> BagMessage:
+    """A message of IMU, wheels or receiver whose stamp is ahead; the others as they are."""
+    t, topic, msgtype, cdr = message
+    if not msgtype.endswith(("/Imu", "/Odometry", "/JointState", "/NavSatFix")):
+        return message
+    stamp = int.from_bytes(cdr[4:8], "little") + seconds
+    return t, topic, msgtype, cdr[:4] + stamp.to_bytes(4, "little") + cdr[8:]
+
+
+def test_stamps_that_leap_without_a_pause_start_the_estimator_anew(messages: list[BagMessage]) -> None:
+    half = len(messages) // 2
+    run = Run().feed(messages[:half], close=False)
+    run.feed([ahead(message, 3600) for message in messages[half:]])
+    assert [line for line in run.said if "started anew" in line] == [
+        "started anew: the stamps of the IMU went ahead by 3600.5 s"
+    ]
+    times = np.array([state.t_ns for state in run.history.states])
+    assert np.diff(times).max() < 3610 * 10**9
+    assert times[-1] - times[0] > 3600 * 10**9, "the new clock is used"
+
+
+def test_stamps_that_leap_for_a_moment_are_refused(messages: list[BagMessage], replayed: Estimate) -> None:
+    few = [ahead(m, 3600) if i % 500 in (50, 51, 52) else m for i, m in enumerate(messages)]
+    run = Run().feed(few)
+    assert run.node.counts["resets"] == 0
+    assert np.linalg.norm(run.history.states[-1].position_m - replayed.trajectory.position_m[-1]) < 0.1
+
+
 def command(text: str) -> tuple[str, str, bytes, int]:
     return "/terrafusion/command", "std_msgs/msg/String", split(CdrTemplate().string(text).rows(1))[0], 0
 
