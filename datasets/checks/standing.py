@@ -31,7 +31,8 @@ def check_standing(context: CheckContext) -> Iterator[Finding]:
         grid = np.arange(max(t[0], measured.t_s[0]), min(t[-1], measured.t_s[-1]), window_s)
         if len(grid) < 2:
             continue
-        far, spread = _extents(t, path, grid), _extents(measured.t_s, measured.place, grid)
+        rolled_to = np.interp(measured.t_s, t, path.real) + 1j * np.interp(measured.t_s, t, path.imag)
+        far, spread = (_extents(measured.t_s, place, grid) for place in (rolled_to, measured.place))
         still = spread < np.maximum(STANDING * far, SIGMAS * measured.sigma_m)
         standing = (far > least_m) & still & (spread > FROZEN_M)  # frozen fixes are another finding
         if not standing.any():

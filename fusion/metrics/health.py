@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import travelled_m
 
@@ -14,6 +15,8 @@ SPEED_FACTOR, SPEED_SLACK_MPS = 1.5, 1.0
 LEAST_PATH, MOST_PATH, PATH_SLACK_M = 0.2, 1.2, 5.0
 """Plausible path as a share of the wheels' path, with a margin for short runs. The median measured slip on
 ice is 0.64 (docs/evidence/field.md), a share of 0.36."""
+NOISE_SIGMAS = 3.0
+"""Steps of fewer sigmas of the position may be noise of the estimate."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,23 @@ def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Hea
         why = "the covariance is not finite and positive"
     elif speed > SPEED_FACTOR * fastest + SPEED_SLACK_MPS:
         why = f"{speed:.1f} m/s with wheels of at most {fastest:.1f} m/s"
-    elif not LEAST_PATH * rolled - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
+    elif moved > MOST_PATH * rolled + PATH_SLACK_M:
+        moved = beyond_noise_m(path)
+    if not why and not LEAST_PATH * rolled - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
         why = f"a path of {moved:.0f} m where the wheels rolled {rolled:.0f} m"
     return Health(speed, moved, rolled, why)
+
+
+def beyond_noise_m(path: Trajectory) -> float:
+    """Length of the polygon of those positions that lie beyond the noise from its corner before, m."""
+    assert path.covariance is not None
+    least_m = NOISE_SIGMAS * np.sqrt(np.maximum(path.covariance[:, 0, 0], path.covariance[:, 1, 1]))
+    corner, *others = (path.position_m[:, 0] + 1j * path.position_m[:, 1]).tolist()
+    length_m = 0.0
+    for place, least in zip(others, least_m[1:].tolist(), strict=True):
+        if (step := abs(place - corner)) > least:
+            length_m, corner = length_m + step, place
+    return length_m
 
 
 def rolled_m(wheels: Wheels, radius_m: float) -> float:

@@ -339,9 +339,15 @@ def _supports(run: Run) -> Iterator[str]:
         yield f"the position error is {scores.ate_m:.2f} m RMS against {_reference(run)}{covered}"
     elif not gnss_innovations(run):
         yield "nothing to check against but the agreement of wheels, gyro and accelerometer"
-    gnss = _row(run, "nis gnss")
-    if gnss is not None:
-        yield f"fixes agree with wheels and IMU: innovations are {gnss.mean**0.5:.1f} times their sigma"
+    fixes = gnss_innovations(run)
+    if used := [i.nis / i.dof for i in fixes if i.accepted]:
+        left_out = (
+            f"; {len(fixes) - len(used)} of {len(fixes)} were rejected" if len(used) < len(fixes) else ""
+        )
+        yield (
+            f"fixes agree with wheels and IMU: innovations are {np.mean(used) ** 0.5:.1f} times their sigma"
+            f"{left_out}"
+        )
 
 
 def _error_m(run: Run) -> float | None:

@@ -255,6 +255,16 @@ def test_wheels_that_roll_under_a_standing_robot_are_named() -> None:
     assert "standing" in {finding.code for finding in run_checks(standing, rig(log))}
 
 
+def test_fixes_that_end_within_a_window_show_no_standing_robot() -> None:
+    log = LOGS["simulated"]()
+    assert log.gnss is not None
+    since_s = (log.gnss.t_ns - log.start_ns) * 1e-9
+    few = dataclasses.replace(
+        log, gnss=log.gnss.select(abs(since_s % 10.0 - 4.5) < 0.5), truth=None, truth_channels=()
+    )
+    assert "standing" not in {finding.code for finding in run_checks(few, rig(log))}
+
+
 def test_a_truth_of_positions_alone_turns_no_wheels() -> None:
     """The yaw of a truth that lists its position alone is not true, and used by no check."""
     log = LOGS["simulated"]()

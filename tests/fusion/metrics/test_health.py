@@ -35,6 +35,20 @@ def test_a_sound_estimate_passes_and_each_way_to_diverge_is_named(drive: Callabl
     assert "path of" in why(trajectory={"position_m": path.position_m * 0.01})
 
 
+@pytest.mark.parametrize(("sigma_m", "named"), [(1.0, False), (0.2, True)])
+def test_a_path_lengthened_by_noise_within_its_sigma_is_sound(
+    drive: Callable[..., Any], sigma_m: float, named: bool
+) -> None:
+    made = drive(seconds=60.0)
+    path = made.estimate.trajectory
+    noise = np.random.default_rng(1).normal(0.0, 0.6, path.position_m.shape)
+    covariance = np.broadcast_to(sigma_m**2 * np.eye(6), (len(path), 6, 6))
+    noisy = dataclasses.replace(path, position_m=path.position_m + noise, covariance=covariance)
+    estimate = dataclasses.replace(made.estimate, trajectory=noisy)
+    assert noisy.path_length_m() > 2.0 * path.path_length_m()
+    assert ("path of" in examine_estimate(estimate, made.recording.wheels, 0.3).why) == named
+
+
 def test_rolled_path_counts_both_ways_and_units() -> None:
     t_ns = np.arange(0, 11, dtype=np.int64) * SECOND_NS
     ahead = np.full((11, 2), 2.0)

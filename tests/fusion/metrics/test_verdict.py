@@ -341,3 +341,12 @@ def test_the_longest_run_is_the_first_of_those_as_long() -> None:
     assert _longest([True, False, True, True, False, True, True]) == (2, 4)
     assert _longest([False]) is None
     assert _longest([True]) == (0, 1)
+
+
+def test_wild_fixes_that_were_rejected_do_not_count_as_agreement(drive):
+    d = drive(offset_m=(0.1, 0.1), sigma_m=0.2)
+    nis = np.random.default_rng(3).chisquare(2, 100)
+    nis[[20, 60]] = 1e5
+    found = verdict(d, estimate=with_innovations(d, nis, accepted=nis < 1e3))
+    assert found.value == "good", found
+    assert found.reasons[1].endswith("innovations are 1.0 times their sigma; 2 of 100 were rejected.")
