@@ -108,7 +108,7 @@ class Estimator:
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
-        self.wheels, self.fixes_ahead = WheelStream(self.newest), FixesAhead(self.newest)
+        self.wheels, self.fixes = WheelStream(self.newest), FixesAhead(self.newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
         self.steering, self._turn = SteeringStream(rig, self.newest), steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu)
@@ -181,9 +181,9 @@ class Estimator:
 
         `fix` is the class of fix ("single" to "fixed"); it gives the sigma where none is sensible.
         """
-        checked = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
-        for one in self.fixes_ahead.admitted(checked):
-            self.gnss.queue(one), self.learned.fix(one)
+        for one in self.fixes.admitted(checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)):
+            self.gnss.queue(one)
+            self.learned.fix(one)
 
     def set_start(
         self,

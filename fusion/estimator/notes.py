@@ -60,7 +60,7 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         )
     for channel, ahead in estimator.newest.refused.items():
         notes.append(f"{ahead} samples of {channel} lay far ahead of IMU and wheels: they were left out")
-    if dropped := estimator.fixes_ahead.dropped:
+    if dropped := estimator.fixes.dropped:
         notes.append(
             f"{dropped} GNSS fixes lay more than {LEAP_NS * 1e-9:g} s ahead of IMU and wheels, and "
             "of fixes that came after them: they were left out"

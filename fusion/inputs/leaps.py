@@ -206,3 +206,12 @@ class FixesAhead:
             return fixes
         self.held = fixes
         return []
+
+    def reached(self) -> list[tuple[int, Any]]:
+        """Those that IMU and wheels have nearly reached meanwhile."""
+        now_ns = self.newest.t_ns
+        if not self.held or now_ns is None or self.held[0][0] - now_ns > LEAP_NS:
+            return []
+        fixes = self.held[:]
+        self.held.clear()
+        return fixes

@@ -302,16 +302,22 @@ class LiveNode:
             return
         for one in self._leap.admitted((t_ns, sample)):
             self._ordered.add(one[0], kind, one[1])
+        for one in self._fixes_ahead.reached():
+            self._ordered.add(one[0], "gnss", one[1])
 
     def _is_ahead(self, t_ns: int, receipt_ns: int) -> bool:
-        """Whether the stamps of the IMU leap without a pause in the messages; begins anew where they stay."""
+        """Whether the stamps of the IMU leap ahead of the time of this computer; begins anew where they stay.
+
+        A bag that is played has stamps of the past.
+        """
         newest_ns = self._leap.newest.t_ns
-        if newest_ns is not None and t_ns - newest_ns > receipt_ns - self._received_ns + LEAP_NS:
+        before_ns = t_ns if newest_ns is None else newest_ns
+        if t_ns - receipt_ns > LEAP_NS >= before_ns - self._received_ns and self._leap.newest.leaps(t_ns):
             if self._ahead_ns is None:
                 self._ahead_ns = t_ns
             if t_ns - self._ahead_ns < CONFIRMED_NS:
                 return True
-            self.reset(f"the stamps of the IMU went ahead by {(t_ns - newest_ns) * 1e-9:.1f} s")
+            self.reset(f"the stamps of the IMU went ahead by {(t_ns - before_ns) * 1e-9:.1f} s")
         self._received_ns, self._ahead_ns = receipt_ns, None
         return False
 

@@ -204,8 +204,8 @@ def test_fixes_of_a_receiver_whose_clock_is_ahead_are_used(running: Running) -> 
             count += 1
         estimator.add(message)
     assert count > 5
-    assert estimator.fixes_ahead.dropped == 0
-    assert len(estimator.fixes_ahead.held) < 3
+    assert estimator.fixes.dropped == 0
+    assert len(estimator.fixes.held) < 3
 
 
 @pytest.mark.parametrize("wrong", [1, 3, 7])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 from pathlib import Path
 
@@ -39,7 +40,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "benchmark": ("benchmark", "--only", "firm=1", "--jobs", "1", "--out", "out/run"),
     "init": ("init", "log", "--track", "0.62", "--out", "out/robot.yaml"),
     "study": ("study", "--quick", "--seeds", "1", "--jobs", "1", "--out", "out/run"),
-    "gap-blind": ("gap-blind", "--share", "0.01", "--no-opponent", "--out", "out/run"),
+    "gap-blind": ("gap-blind", "--quick", "--no-opponent", "--out", "out/run"),
     "policy fit": ("policy", "fit", "--seeds", "1", "--ground", "asphalt", "--out", "out/policy.yaml"),
     "terrain train": ("terrain", "train", "--seeds", "1", "--jobs", "1", "--out", "out/model.yaml"),
 }  # fmt: skip
@@ -70,6 +71,7 @@ def preload() -> None:
     for part in ("fusion.replay", "fusion.cli.main", "twin.simulate", "datasets.writers"):
         importlib.import_module(f"terrafusion.{part}")
     _shorten_training()
+    _shorten_blind_check()
 
 
 def _shorten_training() -> None:
@@ -80,3 +82,11 @@ def _shorten_training() -> None:
     scenarios = train_detector.SCENARIOS
     train_detector.TrainingPlan.__init__.__defaults__ = (1, scenarios, none, none)  # type: ignore[misc]
     policy_fit.SLOPES_DEG, policy_fit.PAYLOADS_KG = none, none
+
+
+def _shorten_blind_check() -> None:
+    """One sealed trial, without effect, of one run and few references."""
+    from terrafusion.twin.gap.blind import plan
+
+    plan.QUICK = plan.CheckSize(1, *[0] * (len(dataclasses.fields(plan.CheckSize)) - 1))
+    plan.USUAL_REFERENCES, plan.RUNS = 3, 1
