@@ -33,6 +33,7 @@ from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import Explanation, explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
+from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.delay import DELAYS
@@ -172,9 +173,12 @@ def make(number: int, jobs: int = 1) -> dict[str, Any]:
         evidence = gather_evidence(runs, references, load_vehicle(of.robot), of.soil, candidates, jobs=jobs)
         sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
         robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+        drives = drive_coverage(evidence.runs, evidence.references, evidence.model)
         evidence, robot = with_law_misfit(evidence, sigma, robot)
         found = detect([score(r, sigma) for r in evidence.runs], robot, candidates, 0)
-        seen, out = found.p_value <= SIGNIFICANCE, {"number": number, "truth": of.changes, "p": found.p_value}
+        seen = found.p_value <= SIGNIFICANCE
+        out = {"number": number, "truth": of.changes, "p": found.p_value}
+        out["other_drives"] = drives is not None and drives.limits()
         left = {"known": ()}
         if len(of.effects()) == 1 and seen:
             forms = {"/".join(key.split("/")[:2]) for key in of.changes}
@@ -195,7 +199,8 @@ def stored(found: Explanation, candidates: Candidates) -> dict[str, Any]:
             sigma = math.sqrt(float(fit.covariance[0][0, 0]))
             sizes[candidates.keys[column]] = (float(fit.values[0][0]) * scale, sigma * scale)
     evidence = {"+".join(k): v for k, v in found.evidence.items() if math.isfinite(v)}
-    return {"evidence": evidence, "outside": found.outside, "sizes": sizes}
+    alike = {effect: sorted(some) for effect, some in found.alike.items()}
+    return {"evidence": evidence, "outside": found.outside, "sizes": sizes, "alike": alike}
 
 
 def restored(found: Mapping[str, Any]) -> Explanation:

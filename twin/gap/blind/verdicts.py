@@ -73,16 +73,25 @@ def _judge(trial: Trial, answer: Mapping[str, Any], seconds: float) -> Judged:
     if verdict == "parameters" and not groups:
         groups = [{PARAMETER}]
     share = (answer["shrink"] or {}).get("share")
-    probability = sum(float(c["probability"]) for c in causes if c["effect"] in classes[0])
     return Judged(
         trial, False, bool(answer["gap"]["detected"]), verdict,
         rank=next((i + 1 for i, known in enumerate(classes) if truth and truth[0] in known), 0),
         first=str(causes[0]["effect"]) if causes else None,
         first_class=tuple(sorted(classes[0])) if classes else (),
-        confidence=min(max(probability, 0.0), 1.0), found=sum(any(e in g for g in groups) for e in truth),
+        confidence=_stated(answer, causes, classes), found=sum(any(e in g for g in groups) for e in truth),
         extras=sum(not g.intersection(truth) for g in groups), deviation=_deviation(trial, causes),
         shrink=None if share is None else float(share), seconds=seconds,
     )  # fmt: skip
+
+
+def _stated(
+    answer: Mapping[str, Any], causes: Sequence[Mapping[str, Any]], classes: Sequence[set[str]]
+) -> float:
+    """Stated probability that the class ranked first holds a true effect: that of its credible set, or, of a
+    method that states none, of its members together."""
+    own = [float(s["probability"]) for s in answer.get("sets", ()) if {*s["effects"]} == classes[0]]
+    members = sum(float(c["probability"]) for c in causes if c["effect"] in classes[0])
+    return min(max(own[0] if own else members, 0.0), 1.0)
 
 
 def _deviation(trial: Trial, causes: Sequence[Mapping[str, Any]]) -> float | None:

@@ -1,5 +1,6 @@
 """Maps each observed sample of a log to the samples of the twin's run that it averages."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -48,6 +49,13 @@ def sample_map(log: PreparedLog) -> SampleMap:
         coarse = [_coarse(o, log) for o in log.observed]
         known = _CACHE[log] = SampleMap(blocks, _equally_spaced(log, blocks), fine, coarse)
     return known
+
+
+def with_observed(log: PreparedLog, observed: Sequence[Observed]) -> PreparedLog:
+    """The log with other values or sigmas of its samples, whose times are the same."""
+    out = dataclasses.replace(log, observed=tuple(observed))
+    _CACHE[out] = sample_map(log)
+    return out
 
 
 def window_starts(log: PreparedLog) -> Indices:

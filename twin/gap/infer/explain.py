@@ -141,18 +141,19 @@ class _Explainer:
         each = 0.5 * (square * (vectors.T @ m.K[basis, m.error]) ** 2 / grown - np.log(grown)).sum(axis=1)
         return float(np.logaddexp.reduce(each) - math.log(len(each)))
 
-    def weights(self, runs: Sequence[Products], best: Fitted, weight: Array) -> Array:
+    def reference_energies(self) -> Array:
+        """(C,) mean squared error of each channel of the references, one without them."""
+        ones, none = np.ones(len(self.evidence.channels)), np.zeros(0)
+        own = [Products.of(r, np.zeros((len(r.time_s), 0))) for r in self.evidence.references]
+        each = [energies(run, none, ones, self.sigma, self.robot) for run in own]
+        return np.maximum(np.mean(each, axis=0), LEAST_NORMAL) if each else ones
+
+    def weights(self, runs: Sequence[Products], best: Fitted, weight: Array, normal: Array) -> Array:
         """(C,) one over the factor by which the best set's rest is above the references', at least one."""
         P = runs[0].shared
         moved = dataclasses.replace(self.robot, mean=self.robot.mean + best.used[:P])
         used = best.used[P:-2]
         now = np.mean([energies(run, used, weight, self.sigma, moved) for run in runs], axis=0)
-        normal = np.ones(len(now))
-        if self.evidence.references:
-            ones, none = np.ones(len(weight)), np.zeros(0)
-            own = [Products.of(r, np.zeros((len(r.time_s), 0))) for r in self.evidence.references]
-            each = [energies(run, none, ones, self.sigma, self.robot) for run in own]
-            normal = np.maximum(np.mean(each, axis=0), LEAST_NORMAL)
         return np.asarray(1.0 / np.maximum(now / normal, 1.0))
 
 
@@ -195,13 +196,13 @@ def explain(
         _, beside, _ = laws.best(m, m.K[:, m.error] - m.K @ used[best])
         sizes = {i: [values[i]] + [beside[i]] * (len(some) > 1) for i, some in sizes.items()}
     runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, {i: used[i] for i in sizes})
-    weight, before = np.ones(len(evidence.channels)), np.zeros(0)
+    weight, before, normal = np.ones(len(evidence.channels)), np.zeros(0), own.reference_energies()
     for _ in range(ROUNDS):
         m = own.metric(runs, weight)
         laws = Laws.of(evidence.candidates, bank.ladders, m.shared, m.none)
         found = CloseLook(m, laws, tuple(sizes), extra).search()
         top = max(found, key=lambda laws: found[laws].evidence - 5.0 * len(laws))
-        before, weight = weight, own.weights(runs, found[top], weight)
+        before, weight = weight, own.weights(runs, found[top], weight, normal)
         if np.allclose(before, weight, rtol=0.1):
             break
     chance = ReferenceGains.of(

@@ -103,11 +103,13 @@ def _learn(references: Sequence[Score], candidates: int, scale: float) -> RobotO
 
 def _log_likelihood(references: Sequence[Score], scatter: Array, prior: Array) -> float:
     """Log likelihood of the references' scores with all offsets integrated out, but for a constant."""
+    from scipy.linalg import solve_triangular
+
     known, gain = np.diag(1.0 / prior), np.zeros(len(prior))
     total = -0.5 * float(np.log(prior).sum() + len(references) * np.log(scatter).sum())
     for r in references:
         L = np.linalg.cholesky(r.A + np.diag(1.0 / scatter))
-        half = np.linalg.solve(L, np.column_stack([r.A, r.b]))
+        half = solve_triangular(L, np.column_stack([r.A, r.b]), lower=True)
         moved, own = half[:, :-1], half[:, -1]
         total += 0.5 * float(own @ own) - float(np.log(np.diag(L)).sum())
         known += r.A - moved.T @ moved
@@ -140,13 +142,28 @@ def learn_misfit(
 def _posterior(references: Sequence[Score], scatter: Array, prior: Array) -> tuple[Array, Array, Array]:
     """Mean (P,) and covariance (P, P) of the robot's offsets, and the sum (P,) of the expected squares of the
     runs' own."""
-    within = [np.linalg.inv(r.A + np.diag(1.0 / scatter)) for r in references]
-    moved = [H @ r.A for r, H in zip(references, within, strict=True)]
-    known = np.diag(1.0 / prior) + sum(r.A - r.A @ m for r, m in zip(references, moved, strict=True))
-    gain = np.sum([r.b - m.T @ r.b for r, m in zip(references, moved, strict=True)], axis=0)
-    covariance: Array = np.asarray(np.linalg.inv(known))
-    mean, square = covariance @ gain, np.zeros(len(scatter))
-    for r, H, m in zip(references, within, moved, strict=True):
-        own = H @ (r.b - r.A @ mean)
-        square += own**2 + np.diag(H) + np.einsum("ij,ij->i", m @ covariance, m)
+    own = 1.0 / scatter  # information on a run's own beforehand; with H, H A = 1 - H own
+    within = [inverse(r.A + np.diag(own)) for r in references]
+    known, gain = np.diag(1.0 / prior + len(references) * own), np.zeros(len(own))
+    for r, H in zip(references, within, strict=True):
+        known -= own[:, None] * H * own
+        gain += own * (H @ r.b)
+    covariance = inverse(known)
+    mean, square = covariance @ gain, np.zeros(len(own))
+    for r, H in zip(references, within, strict=True):
+        moved = np.eye(len(own)) - H * own
+        square += (H @ (r.b - r.A @ mean)) ** 2 + np.diag(H)
+        square += np.einsum("ij,ij->i", moved @ covariance, moved)
     return mean, covariance, square
+
+
+def inverse(matrix: Array) -> Array:
+    """Of a symmetric positive definite matrix (P, P)."""
+    from scipy.linalg.lapack import dpotrf, dpotri
+
+    half, failed = dpotrf(matrix, lower=1)
+    if failed:
+        return np.asarray(np.linalg.inv(matrix))
+    out, _ = dpotri(half, lower=1)
+    lower = np.tril(out)
+    return np.asarray(lower + np.tril(out, -1).T)

@@ -28,13 +28,10 @@ LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet
 
 def data_sheet_noise(runs: Sequence[RunResiduals]) -> dict[str, ResidualNoise]:
     """Noise of the data sheets' sigma and correlation, by channel."""
-    out: dict[str, ResidualNoise] = {}
-    for run in runs:
-        lags = _lags([run])
-        for observed in run.log.observed:
-            if observed.channel not in out:
-                rho = _sheet_correlation([run], observed.channel, lags[observed.channel]) or (1.0,)
-                out[observed.channel] = ResidualNoise(1.0, rho)
+    out, lags = dict[str, ResidualNoise](), _lags(runs)
+    for channel in dict.fromkeys(o.channel for run in runs for o in run.log.observed):
+        rho = _sheet_correlation(runs, channel, lags[channel]) or (1.0,)
+        out[channel] = ResidualNoise(1.0, rho)
     return out
 
 

@@ -30,6 +30,7 @@ MOSTLY_COVERED = 0.8
 """Share of the judged time from which the drives do not limit the answer."""
 
 Cell = tuple[int, int, int]
+Seconds = dict[Cell, float]
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,16 @@ class DriveCoverage:
         return self.covered < MOSTLY_COVERED
 
 
-def time_by_cell(twist: Array) -> dict[Cell, float]:
+def time_by_cell(twist: Array) -> Seconds:
     """Seconds by cell of commanded speed, turn rate and acceleration; `twist` is (N, 2), m/s and rad/s."""
     kernel = np.ones(SMOOTH_SAMPLES) / SMOOTH_SAMPLES
     rate = np.pad(np.gradient(twist[:, 0], DT_S), SMOOTH_SAMPLES // 2, mode="edge")
     columns = np.stack([twist[:, 0], twist[:, 1], np.convolve(rate, kernel, mode="valid")], axis=1)
     index = np.round(columns / [SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2]).astype(np.int64)
-    cells, count = np.unique(index, axis=0, return_counts=True)
-    return {(int(c[0]), int(c[1]), int(c[2])): DT_S * float(n) for c, n in zip(cells, count, strict=True)}
+    low, sides = index.min(axis=0), tuple((np.ptp(index, axis=0) + 1).tolist())
+    number, count = np.unique(np.ravel_multi_index(tuple((index - low).T), sides), return_counts=True)
+    cells = (np.stack(np.unravel_index(number, sides), axis=1) + low).tolist()
+    return {(a, b, c): DT_S * n for (a, b, c), n in zip(cells, count.tolist(), strict=True)}
 
 
 def drive_coverage(
@@ -68,7 +71,7 @@ def drive_coverage(
 
 def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverage:
     """Coverage of commanded twists (N, 2) each, by those of references."""
-    known, judged = _summed(references), _summed(runs)
+    known, judged = (_summed([time_by_cell(twist) for twist in some]) for some in (references, runs))
     total = sum(judged.values())
     lacking = {c: s for c, s in judged.items() if known.get(c, 0.0) < min(LEAST_S, s)}
     words = dict[str, float]()
@@ -83,24 +86,28 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     """Share of the commands, by time, that runs and references have in common, over that of as many of the
     references with the rest, at most one; twists as for `coverage`."""
-    size = min(len(runs), len(references) // 2)
+    size, known = min(len(runs), len(references) // 2), [time_by_cell(twist) for twist in references]
+    if not size:
+        return 1.0
     own = [
-        _in_common(references[i : i + size], [*references[:i], *references[i + size :]])
-        for i in range(0, len(references) - size + 1, max(size, 1))
+        _in_common(known[i : i + size], [*known[:i], *known[i + size :]])
+        for i in range(0, len(known) - size + 1, size)
     ]
-    return min(_in_common(runs, references) / max(float(np.mean(own)), 1e-9), 1.0) if size else 1.0
+    return min(
+        _in_common([time_by_cell(twist) for twist in runs], known) / max(float(np.mean(own)), 1e-9), 1.0
+    )
 
 
-def _in_common(runs: Sequence[Array], others: Sequence[Array]) -> float:
+def _in_common(runs: Sequence[Seconds], others: Sequence[Seconds]) -> float:
     a, b = _summed(runs), _summed(others)
     total, of_others = sum(a.values()), sum(b.values())
     return sum(min(seconds / total, b.get(cell, 0.0) / of_others) for cell, seconds in a.items())
 
 
-def _summed(twists: Sequence[Array]) -> dict[Cell, float]:
-    out = dict[Cell, float]()
-    for twist in twists:
-        for cell, seconds in time_by_cell(twist).items():
+def _summed(parts: Sequence[Seconds]) -> Seconds:
+    out = Seconds()
+    for part in parts:
+        for cell, seconds in part.items():
             out[cell] = out.get(cell, 0.0) + seconds
     return out
 

@@ -108,12 +108,12 @@ def gather_evidence(
     normal = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
     noise = learn_noise(normal, judged, candidates, jobs, first)
     with ThreadPoolExecutor(jobs) as threads:
-        white = list(threads.map(lambda run: whitened(run, noise), [*judged, *normal]))
-        every, usual = [*judged, *normal], reference_loudness(white[R:])
-        louder = [with_loud_noise(run, own, usual) for run, own in zip(every, white, strict=True)]
-        pairs = zip(louder, every, white, strict=True)
-        white = list(threads.map(lambda p: p[2] if p[0] is p[1] else whitened(p[0], noise), pairs))
-    judged, normal = louder[:R], louder[R:]
+        every = [*judged, *normal]
+        errors = list(threads.map(lambda run: whitened(run.errors_alone(), noise), every))
+        usual = reference_loudness(errors[R:])
+        every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
+        white = list(threads.map(lambda run: whitened(run, noise), every))
+    judged, normal = every[:R], every[R:]
     clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.data.samples import Indices, sample_map
+from terrafusion.twin.gap.data.samples import Indices, sample_map, with_observed
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun
 
 STRETCH = 32  # samples over which noise is taken to be equally loud
@@ -40,7 +40,7 @@ def with_loud_noise(run: RunResiduals, white: WhitenedRun, usual: Array) -> RunR
     if not loud:
         return run
     observed = [dataclasses.replace(o, sigma=s) for o, s in zip(run.log.observed, sigma, strict=True)]
-    return dataclasses.replace(run, log=dataclasses.replace(run.log, observed=tuple(observed)))
+    return dataclasses.replace(run, log=with_observed(run.log, observed))
 
 
 def _stretches(run: WhitenedRun) -> Iterator[tuple[int, Indices, float]]:

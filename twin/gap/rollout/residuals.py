@@ -22,7 +22,7 @@ from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import aligned_start
-from terrafusion.twin.gap.data.samples import Indices, sample_map
+from terrafusion.twin.gap.data.samples import Indices, sample_map, with_observed
 from terrafusion.twin.gap.rollout.nuisance import nuisance_columns
 from terrafusion.twin.gap.rollout.sensitivities import (
     Linearisation,
@@ -70,6 +70,11 @@ class RunResiduals:
     def without_nuisance(self) -> Self:
         """Without the nuisance basis: half of all columns, which only the scores need."""
         return dataclasses.replace(self, by_nuisance=[p[:, :0] for p in self.by_nuisance])
+
+    def errors_alone(self) -> Self:
+        """Without all columns."""
+        none = [e[:, None][:, :0] for e in self.error]
+        return dataclasses.replace(self, by_state=none, by_effect=none, by_nuisance=none)
 
     def stacked(self) -> list[Array]:
         """State, effect, nuisance, error and pose columns of each channel, side by side."""
@@ -244,8 +249,9 @@ def with_timing(log: PreparedLog, predicted: Sequence[Array]) -> PreparedLog:
         return log
     late_s = log.input_step_s / math.sqrt(3.0)  # of a uniform distribution
     pairs = zip(log.observed, predicted, strict=True)
-    out = [dataclasses.replace(o, timing=_timing_sigma(o, log, y, late_s)) for o, y in pairs]
-    return dataclasses.replace(log, observed=tuple(out))
+    return with_observed(
+        log, [dataclasses.replace(o, timing=_timing_sigma(o, log, y, late_s)) for o, y in pairs]
+    )
 
 
 def _timing_sigma(observed: Observed, log: PreparedLog, predicted: Array, late_s: float) -> Array:

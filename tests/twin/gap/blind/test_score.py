@@ -66,6 +66,16 @@ def test_guesses_score_at_chance_and_their_confidence_is_honest() -> None:
     assert found["unknown"]["recall"]["rate"] == 0.0
 
 
+def test_the_certainty_judged_is_that_of_the_credible_set_as_the_reader_sees_it() -> None:
+    """Effects that act together share the probability of a cause; that one of them is present is certain."""
+    trial = one(PLAIN, "same")
+    (effect,) = trial.effects()
+    answer = fake.diagnosis("effect", [(effect, 0.5), ("another", 0.5)], [effect, "another"])
+    assert judge(trial, as_answers([trial], lambda t: answer)[trial.trial]["diagnosis"]).confidence == 0.5
+    answer["sets"] = [{"effects": [effect], "probability": 0.98, "named": True}]
+    assert judge(trial, as_answers([trial], lambda t: answer)[trial.trial]["diagnosis"]).confidence == 0.98
+
+
 def test_a_pair_counts_where_both_effects_are_seen_alone() -> None:
     """An effect that is not even seen alone is no fault of the search for two."""
     trials = plan(0, FULL)
