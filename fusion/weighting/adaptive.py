@@ -83,18 +83,20 @@ class TerrainNoise:
         self._source = "detector"
 
     def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
-        """Take over the slip that the robot itself shows, for the ground that no class describes.
+        """Take over the slip that the robot itself shows: mean and sigma for the ground that no class
+        describes, and on all grounds how long slip lasts.
 
-        `time_s`: correlation time of the slip of whole runs, which is at most the policy's.
+        `time_s`: correlation time of the slip of whole runs; none is longer than the policy's.
         """
-        time_s = min(time_s, self.policy.fixed.slip_time_s)
         if not self.adaptive:
+            time_s = min(time_s, self.policy.fixed.slip_time_s)
             self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma, slip_time_s=time_s)
-        elif self._starts_pooled:
+            return
+        self._slip_times_s = np.minimum(self.policy.slips()[3], time_s)
+        if self._starts_pooled:
             own = self.detector.classes.index(UNKNOWN)
-            means, sigmas = self._slips
-            means[own], sigmas[own], self._slip_times_s[own] = mean, sigma, time_s
-            self._reweight(t_ns)
+            self._slips[0][own], self._slips[1][own] = mean, sigma
+        self._reweight(t_ns)
 
     def learned_grounds(self) -> GroundMemory | None:
         """What the ground memory holds by now, condensed; None where there is none."""

@@ -1,9 +1,10 @@
 """Slip of each ground class as the drive itself shows it while fixes are good.
 
 The policy's slip is that of many drives; on one drive soil, load and tyres are the same, and the slip of a
-ground comes back. The mean on this drive has the policy's as its prior. Slip measured over a time T differs
-from it by the errors of the measurement and by the slip's own changes, of which a correlation time t leaves
-the variance sigma^2 2 t / (T + 2 t). The spread about the mean is the posterior of a normal's variance
+ground comes back. The mean on this drive has the policy's as its prior, with the spread of slip over all
+grounds: one that looks like a class of the policy may be another ground. Slip measured over a time T differs
+from the mean by the errors of the measurement and by the slip's own changes, of which a correlation time t
+leaves the variance sigma^2 2 t / (T + 2 t). The spread about the mean is the posterior of a normal's variance
 (conjugate: Gelman et al. 2013, Bayesian Data Analysis, sec. 3.3) whose prior counts for `PRIOR_SPREAD`
 observations.
 """
@@ -13,10 +14,9 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.noise.policy import Policy
 
-BETWEEN, LEAST_BETWEEN = 3.0**-0.5, 0.02
-"""1 sigma of the means of drives on one ground, over the policy's spread, which holds that of means (on loose
-sand of training drives the means scatter by .026, slips in a drive by .035), and the least: the ground may be
-none of the policy's (both assumed for all grounds)."""
+WITHIN = 2.0 / 3.0
+"""Share of a ground's variance of slip that a single drive shows; the rest is between means of drives (on
+loose sand of training drives means scatter by .026, slips in a drive by .035; assumed for all grounds)."""
 PRIOR_SPREAD = 4.0
 WINDOW_S = 1.0
 """Duration of a window; those that overlap share their measurement."""
@@ -27,6 +27,8 @@ class DrivenSlip:
 
     def __init__(self, policy: Policy) -> None:
         self._prior, self._prior_sigma, self._per_grade, self._time_s = policy.slips()
+        self._within = WITHIN * self._prior_sigma**2
+        self._between = policy.fixed.slip_sigma**2
         k = len(self._prior)
         self._driven_s, self._known, self._mean = np.zeros(k), np.zeros(k), np.zeros(k)
         self._count, self._square = np.zeros(k), np.zeros(k)
@@ -50,12 +52,10 @@ class DrivenSlip:
 
     def posterior(self) -> tuple[Array, Array]:
         """Mean and 1 sigma (k,) of the slip to expect on each class."""
-        between = np.maximum(BETWEEN * self._prior_sigma, LEAST_BETWEEN)
-        within = self._prior_sigma**2 * (1.0 - BETWEEN**2)
         seen, n = self._known > 0.0, self._count
-        changes = within * 2.0 * self._time_s / (self._driven_s + 2.0 * self._time_s)
+        changes = self._within * 2.0 * self._time_s / (self._driven_s + 2.0 * self._time_s)
         variance = 1.0 / np.where(seen, self._known, 1.0) + changes
-        share = np.where(seen, between**2 / (between**2 + variance), 0.0)
-        spread = (PRIOR_SPREAD * within + self._square) / (PRIOR_SPREAD + n)
+        share = np.where(seen, self._between / (self._between + variance), 0.0)
+        spread = (PRIOR_SPREAD * self._within + self._square) / (PRIOR_SPREAD + n)
         sigma = np.sqrt(spread + share * variance)
         return self._prior + share * (self._mean - self._prior), np.where(seen, sigma, self._prior_sigma)

@@ -56,7 +56,7 @@ def test_other_grounds_stay_and_the_grade_is_taken_out() -> None:
 
 def test_slip_that_is_measured_badly_counts_little_and_slip_that_varies_stays_wide() -> None:
     own = PRIOR[SAND] + 0.06
-    good, bad = (driven(5.0, own, sigma).posterior()[0][SAND] for sigma in (0.01, 0.2))
+    good, bad = (driven(5.0, own, sigma).posterior()[0][SAND] for sigma in (0.01, 0.5))
     assert abs(bad - PRIOR[SAND]) < 0.2 * abs(good - PRIOR[SAND])
     varying = DrivenSlip(POLICY)
     for k in range(400):
@@ -74,6 +74,12 @@ def test_a_ground_that_the_policy_lacks_shows_its_slip_within_a_minute() -> None
     mean, sigma = found.posterior()
     assert mean[asphalt] > 0.02
     assert abs(mean[asphalt] - 0.04) < 2.0 * sigma[asphalt]
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.06, 0.3])
+def test_slip_of_half_a_minute_outweighs_that_of_the_class_it_looks_like(slip: float) -> None:
+    """The policy's loose sand slips by .13: one that slips otherwise is another ground."""
+    assert driven(35.0, slip, 0.02).posterior()[0][SAND] == pytest.approx(slip, abs=0.005)
 
 
 def test_a_ground_that_is_less_likely_than_another_learns_nothing() -> None:
@@ -108,7 +114,7 @@ def test_mean_and_spread_are_those_of_two_normals_by_hand() -> None:
     for off in (0.03, 0.09):
         found.add(ON_SAND, PRIOR[SAND] + off, sigma, 0.0, 0.5 * driven_s)
     mean, spread = (values[SAND] for values in found.posterior())
-    between, within = sigma**2 / 3.0, sigma**2 * 2.0 / 3.0
+    between, within = POLICY.fixed.slip_sigma**2, sigma**2 * 2.0 / 3.0
     variance = (
         sigma**2 / driven_s + within * 2.0 / 10.0
     )  # of what was measured: its errors, slip's own changes

@@ -77,13 +77,19 @@ def test_slip_that_the_robot_shows_is_that_of_ground_no_class_describes(robot: s
     knows_its_grounds = robot == "elevate"
     assert (adaptive.noise.slip_mean == pytest.approx(0.3)) != knows_its_grounds
     assert (adaptive.noise.slip_sigma == pytest.approx(0.07)) != knows_its_grounds
-    assert (adaptive.noise.slip_time_s == pytest.approx(0.2)) != knows_its_grounds
+    assert adaptive.noise.slip_time_s == pytest.approx(0.2), "of all grounds"
 
 
 def test_no_slip_lasts_longer_than_the_policy_says() -> None:
     weights = noise_of("husky", mode="fixed")
     weights.learn_slip(0.0, 0.05, 1000.0, 0)
     assert weights.noise.slip_time_s == weights.policy.fixed.slip_time_s
+    weights = noise_of("elevate")
+    times_s = weights.policy.slips()[3]
+    for own_s in (1000.0, 10.0):
+        weights.learn_slip(0.0, 0.05, own_s, 0)
+        share = np.array(list(weights.posterior().values()))
+        assert weights.noise.slip_time_s == pytest.approx(share @ np.minimum(times_s, own_s))
 
 
 def test_changes_of_the_noise_are_recorded_from_a_tenth_on_with_their_reason() -> None:
