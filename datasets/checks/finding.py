@@ -22,8 +22,6 @@ class Finding:
     Attributes:
         code: stable name of its kind, such as "imu-axes".
         severity: "error" (results would be wrong) or "warning" (results are less accurate).
-        channel: the affected channel.
-        what: a description.
         evidence: the numbers behind it.
         fix: what to do about it.
         repair: function that does so; None where the correct numbers cannot be inferred.

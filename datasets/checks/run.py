@@ -87,7 +87,6 @@ def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     """All findings of all checks, errors first.
 
     Args:
-        recording: the log.
         rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN and huge numbers warn

@@ -70,16 +70,14 @@ def repair_together(
                     remaining = [step for step in steps[other] if step[0] != shared]
                     steps[other] = sorted([*remaining, (shared, lack)])
                     fixed[other] = _shifted(times[other], steps[other], other)
-    return fixed, tuple(jump for name in times for jump in _jumps(name, fixed[name], steps[name]))
+    return fixed, tuple(
+        ClockJump(name, int(fixed[name][row]), -lack / 1e9) for name in times for row, lack in steps[name]
+    )
 
 
 def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:
     """Stable order (N,) that sorts rows by time; None where they are sorted."""
     return np.argsort(t_ns, kind="stable") if (t_ns[1:] < t_ns[:-1]).any() else None
-
-
-def _jumps(channel: str, repaired: TimesNs, steps: list[Step]) -> tuple[ClockJump, ...]:
-    return tuple(ClockJump(channel, int(repaired[row]), -lack / 1e9) for row, lack in steps)
 
 
 def _shifted(t_ns: TimesNs, steps: list[Step], channel: str) -> TimesNs:

@@ -44,10 +44,7 @@ def too_much(file: Path | str, what: str, most: float, remedy: str = "split it",
     """The error that a file has more than `most` of something.
 
     Args:
-        file: the file.
         what: what is counted, such as "rows".
-        most: the limit.
-        remedy: what to do.
         place: the channel, where known.
     """
     return DataError(f"has more than {most:,.0f} {what}".replace(",", " "), file=file, remedy=remedy, **place)

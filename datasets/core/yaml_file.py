@@ -20,7 +20,6 @@ def read_yaml(path: Path, most_bytes: int = limits.YAML_BYTES) -> dict[str, Any]
     """The mapping at the top of a YAML file.
 
     Args:
-        path: the file.
         most_bytes: a larger one is refused: pure-Python YAML would take seconds over it.
 
     Raises:

@@ -192,11 +192,8 @@ def read_columns(
     """Parse the columns that are asked for; a last line that was cut off is left out with a note.
 
     Args:
-        path: the file, for messages.
-        data: its bytes, of `read_text`.
         layout: how its rows are written.
         numbers: columns of numbers; empty and NaN cells are missing values.
-        texts: columns that stay text.
 
     Raises:
         DataError: no rows, a line with too few or too many cells, a cell that is no finite number.

@@ -23,7 +23,6 @@ class Request:
     """What a reader gets.
 
     Attributes:
-        path: the file or folder.
         rig: geometry of the robot, where known.
         topics: topic by channel, for bags.
         stamps: "header" or "receipt", for bags.
@@ -104,7 +103,6 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
     """The format of a file or folder.
 
     Args:
-        path: the file or folder.
         mapped: a column map was given: text is a table then, as it is where `NAME.columns.yaml` exists.
 
     Raises:

@@ -56,7 +56,6 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
     """Read a log folder.
 
     Args:
-        folder: the folder.
         clocks: times in ns from the start, by channel, in place of those of the files; one for each row.
 
     Returns:

@@ -145,11 +145,8 @@ def _cells(column: NDArray[Any]) -> list[str]:
 
 
 def _quoted(texts: Sequence[str]) -> list[str]:
-    return [f'"{text.replace(chr(34), chr(34) * 2)}"' if _special(text) else text for text in texts]
-
-
-def _special(text: str) -> bool:
-    return any(mark in text for mark in ',"\r\n')
+    special = set(',"\r\n')
+    return [f'"{text.replace(chr(34), chr(34) * 2)}"' if special & set(text) else text for text in texts]
 
 
 def decimal_seconds(t_ns: NDArray[np.int64]) -> list[str]:

@@ -53,7 +53,6 @@ def write_mcap(
     cannot hold to the bit stands on topics of their own, see `readers/ros/exact.py`.
 
     Args:
-        recording: what is written.
         path: the file to write; it appears when it is whole.
         estimate: what to write beside it, or its poses alone; it is not part of the recording and
             not read back.

@@ -50,7 +50,6 @@ class TopicMessages:
     """The messages of one topic.
 
     Attributes:
-        name, msgtype: of the topic.
         t_ns: (N,) times of the messages, never decreasing.
         encode: the messages of a slice of rows, in CDR.
         latched: whether late subscribers get the last message (transient local).

@@ -37,7 +37,6 @@ class Method:
     """One weighting method.
 
     Attributes:
-        mode: of the estimator.
         about: its description in tables.
         sheet: the noise for all grounds is `DATA_SHEET_NOISE`, untuned.
         labels: ground labels given to the estimator: "" (none), "true", "shuffled" or "adversarial".

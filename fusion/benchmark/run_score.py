@@ -28,7 +28,6 @@ class GroundScore:
     """Errors of one replay on one true ground, inside the outage.
 
     Attributes:
-        seconds: time on it.
         forward_mps, side_mps: rms of the velocity error along and across the robot.
         heading_mps: rms of speed times heading error, the velocity error that a wrong heading causes.
         recognised: share of the time in which the estimated ground was the true one ("unknown" if the policy
@@ -54,7 +53,6 @@ class RunScore:
     """One run with one method.
 
     Attributes:
-        arm: name of the method.
         error_m: rms position error inside the outage, or over a whole log; None without a reference.
         end_m, percent: error at the end of the outage, absolute and as percent of the distance in it.
         nees: mean in the outage, per dimension.

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from terrafusion.fusion.benchmark.compare import (
@@ -80,12 +80,10 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
     return [target for target in out if target.found is not None or target.broken]
 
 
-def pooled_nees(
-    rows: Sequence[RunScore], arms: Iterable[str] = (ADAPTIVE, BASELINE)
-) -> list[PooledConsistency]:
+def pooled_nees(rows: Sequence[RunScore]) -> list[PooledConsistency]:
     """NEES of the position by method and ground over all simulated runs: whole runs, and outages only."""
     cells = []
-    for arm in arms:
+    for arm in (ADAPTIVE, BASELINE):
         own = [row for row in rows if row.arm == arm and row.family != FIELD]
         for plant in dict.fromkeys(row.plant for row in own):
             mine = [row for row in own if row.plant == plant]

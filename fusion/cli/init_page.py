@@ -15,7 +15,6 @@ from terrafusion.fusion.cli.inspect_page import Line, clock_table, entry, measur
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.init.answers import Answers
-    from terrafusion.fusion.init.draft import DraftLine
     from terrafusion.fusion.init.vehicle import FirstVehicle
     from terrafusion.fusion.metrics.verdict import Verdict
 
@@ -116,17 +115,14 @@ def _asked(name: str, question: str) -> Any:
     return None
 
 
-def _axes_text(line: DraftLine) -> str:
-    return f"{', '.join(line.raw())} are the {line.comment}"
-
-
 def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
     """What was measured, repaired and assumed, and the file."""
     from terrafusion.datasets.core.json_text import finite
     from terrafusion.fusion.init.geometry import assumed_lines
 
     if "imu_axes" in found.draft:
-        yield from entry("mounting", "", _axes_text(found.draft["imu_axes"]))
+        axes = found.draft["imu_axes"]
+        yield from entry("mounting", "", f"{', '.join(axes.raw())} are the {axes.comment}")
     for name, text in measured_texts(finite(dataclasses.asdict(found.measured))):
         yield from entry(name, "", text)
     if found.calibration is not None:

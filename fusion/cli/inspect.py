@@ -63,11 +63,8 @@ def inspect(
         contents = lines if trials else contents_lines(page)
         write_inspection(report, page, [text for _, text in contents], command_line())
     done = "" if report is None else f"report: {report}"
-    return Result(styled_lines(lines), done, page, int(_has_errors(page)), short=_found(page))
-
-
-def _has_errors(page: dict[str, Any]) -> bool:
-    return any(finding["severity"] == "error" for finding in page.get("findings", ()))
+    failed = any(finding["severity"] == "error" for finding in page.get("findings", ()))
+    return Result(styled_lines(lines), done, page, int(failed), short=_found(page))
 
 
 def _found(page: dict[str, Any]) -> str:

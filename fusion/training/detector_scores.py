@@ -44,7 +44,6 @@ class DetectorScores:
         switches_missed: share of patches (of `MIN_SCORED_PATCH_S` and more) whose ground was never detected.
         false_switches_per_min: switches without a change of ground, per minute of driving.
         update_ms: mean processor time of one update.
-        windows: number of windows counted.
     """
 
     classes: tuple[str, ...]

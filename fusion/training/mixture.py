@@ -23,7 +23,6 @@ def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixt
         x: (n, d), NaN where not observed.
         sigma_floor: (d,) standard deviation added in quadrature to every Gaussian.
         order_by: feature whose quantiles initialise the Gaussians (deterministic).
-        most: largest number of Gaussians.
     """
     best: tuple[float, Mixture] | None = None
     d = x.shape[1]

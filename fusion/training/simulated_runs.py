@@ -171,9 +171,7 @@ def wheel_samples(recording: Recording) -> WheelSamples:
     )
 
 
-def windows_of(
-    recording: Recording, rng: np.random.Generator, slip_observed: bool = True
-) -> tuple[list[Window], NDArray[Any]]:
+def windows_of(recording: Recording, rng: np.random.Generator) -> tuple[list[Window], NDArray[Any]]:
     """Windows every `UPDATE_S` and the ground (n,) at the end of each, by the recording's labels.
 
     Speed and slip of the estimator are simulated: true slip with a Gauss-Markov error of `SLIP_SIGMA` and
@@ -198,7 +196,7 @@ def windows_of(
         around = slice(*np.searchsorted(imu_t, [end - WINDOW_S, end]))
         error = keep * error + markov_spread(keep) * SLIP_SIGMA * rng.normal()
         wheel, speed = float(mean[recent].mean()), float(samples.forward_mps[recent].mean())
-        slip = 1.0 - speed / wheel + error if slip_observed and abs(wheel) > 1e-3 else None
+        slip = 1.0 - speed / wheel + error if abs(wheel) > 1e-3 else None
         span = float(samples.t_s[rows][-1] - samples.t_s[rows][0])
         windows.append(
             Window(

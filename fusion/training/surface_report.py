@@ -14,7 +14,6 @@ from terrafusion.fusion.training.change_detection import MIN_RUN_S, changes_seen
 from terrafusion.fusion.training.cross_validation import (
     FOLDS,
     MIN_RUNS,
-    CrossValidation,
     LabelledRun,
     assign_folds,
     check_runs,
@@ -80,9 +79,9 @@ def ablation(runs: Sequence[LabelledRun], tick: Callable[[], None]) -> dict[str,
     table: dict[str, dict[str, float]] = {}
     for name, features in {"nothing": (), **GROUPS}.items():
         rest = [f for f in SURFACE_FEATURES if f not in features]
-        table[name] = {"without": _f1(cross_validate(runs, rest, ABLATION_TEMPERATURE))}
+        table[name] = {"without": _f1(runs, rest)}
         if features:
-            table[name]["alone"] = _f1(cross_validate(runs, features, ABLATION_TEMPERATURE))
+            table[name]["alone"] = _f1(runs, features)
         tick()
     return table
 
@@ -243,8 +242,8 @@ def _odd(
     return np.asarray(model.oddness(np.vstack([r.x for r in others])) > model.odd_distance)
 
 
-def _f1(folded: CrossValidation) -> float:
-    return folded.scores().macro_f1
+def _f1(runs: Sequence[LabelledRun], features: Sequence[str]) -> float:
+    return cross_validate(runs, features, ABLATION_TEMPERATURE).scores().macro_f1
 
 
 def _stacked(

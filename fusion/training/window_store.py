@@ -16,7 +16,6 @@ class WindowStore:
     """One file a run.
 
     Attributes:
-        folder: of the files.
         state: hash of what the runs depend on; files of another state are not read.
     """
 

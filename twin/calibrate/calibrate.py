@@ -64,7 +64,6 @@ def calibrate(
     """Fit the named parameters to one or more logs of one vehicle.
 
     Args:
-        recordings: the logs.
         vehicle: name, YAML file or `VehicleParams` to start from; the geometry that a log reports
             (`Recording.overrides`) replaces its own.
         soils: the ground of all logs (name, file or `SoilParams`); or grounds by the logs' labels; None:
@@ -79,7 +78,6 @@ def calibrate(
         window_s: the pose starts anew after so long.
         slope_deg: slope of the plane that all logs were driven on.
         aspect_deg: direction in which it rises.
-        payload_kg: the load.
         progress: called with the share done, 0 to 1.
 
     Raises:

@@ -29,7 +29,6 @@ class Coordinate:
     A positive number moves by its logarithm, any other one linearly: the solver does not depend on units.
 
     Attributes:
-        name: dotted name.
         unit: of the number.
         low, high: its range.
         prior: value at w = 0.

@@ -34,7 +34,6 @@ class PreparedLog:
     """One run as the fit uses it; times in seconds from the first input, on a grid of `inputs.DT_S`.
 
     Attributes:
-        name: of the recording.
         sides: (N + 1, 2) wheel speeds of left and right, rad/s, before any dead time.
         follows: whether the twin's wheels follow measured ones.
         labels, borders: grounds in the order driven, and the times (K - 1,) between them.
@@ -79,7 +78,6 @@ def prepare(
     Args:
         source: one of `inputs.SOURCES`.
         truth: use the reference pose as a measurement.
-        window_s: length of the windows.
         ground: name of the ground all along; None: the log's own labels.
         channels: use only these, by name or beginning of a name.
 
@@ -95,7 +93,8 @@ def prepare(
     end_s = min(given.end_s(), max(ends, default=0.0))
     windows = _windows(_begin_s(given.sides, model.slope_rad), end_s, window_s)
     named = [o.channel for o in observed]
-    observed = tuple(filter(_enough, (_within(o, windows, given.gaps) for o in observed)))
+    within = (_within(o, windows, given.gaps) for o in observed)
+    observed = tuple(o for o in within if len(o.value) >= LEAST_ROWS)
     if lost := [name for name in named if name not in {o.channel for o in observed}]:
         notes.append(f"left out, with less than {LEAST_ROWS} rows while the twin drives: {', '.join(lost)}")
     if not observed:
@@ -160,10 +159,6 @@ def window_of(observed: Observed, windows: NDArray[np.int64]) -> NDArray[np.int6
     a mean over an interval to the one the interval lies in."""
     middle = 0.5 * (observed.begin_s + observed.end_s)
     return np.searchsorted(windows[:, 0] * DT_S, middle + 1e-9, side="right") - 1
-
-
-def _enough(observed: Observed) -> bool:
-    return len(observed.value) >= LEAST_ROWS
 
 
 def window_starts(

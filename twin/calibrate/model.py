@@ -33,7 +33,6 @@ class Model:
     """A vehicle on its grounds, and the plane they lie in.
 
     Attributes:
-        vehicle: the robot.
         soils: grounds by name.
         effects: values of optional effects by name.
         slope_rad, aspect_rad, payload_kg: as for `vectors.vehicle_vector`.

@@ -91,7 +91,6 @@ def autoregressive(series: Sequence[tuple[Rows, Array]], lags: int) -> tuple[flo
 
     Args:
         series: slots (n,) and residuals (n,) in units of their sigma, one pair a window.
-        lags: number of lags.
     """
     total = sum(len(values) for _, values in series)
     order = min(MAX_ORDER, total // 10)

@@ -105,10 +105,11 @@ class Calibration:
 
     def __getitem__(self, name: str) -> FittedParameter:
         """A parameter by its name; `soil.` stands for the ground where there is one only."""
-        return next(f for f in self.fitted if f.name == name or self._is_soil(name, f.name))
-
-    def _is_soil(self, name: str, spelt: str) -> bool:
-        return len(self.model.soils) == 1 and f"soil.{spelt.partition('.')[2]}" == name
+        alone = len(self.model.soils) == 1
+        return next(
+            f for f in self.fitted
+            if f.name == name or (alone and f"soil.{f.name.partition('.')[2]}" == name)
+        )  # fmt: skip
 
     def converged(self) -> bool:
         """Whether the search converged; if not, values and sigma are not valid."""

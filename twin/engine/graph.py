@@ -200,7 +200,6 @@ def packs(
     wheels' values equally often.
 
     Args:
-        graph: the operations.
         nodes: those that are needed, in topological order.
         key: what else must be equal in a group.
         lane_of: which arguments belong to which wheel.

@@ -73,16 +73,13 @@ def _accumulate(
         # mapaccum holds one column of each argument a step: what is constant is repeated by the map.
         if count not in chunks:
             chunks[count] = one.mapaccum("tf_chunk", count)
+        repeated = (np.tile(c, count) if c.ndim == 2 else c for c in constants)
         block = chunks[count](
             out[first], times[None, :], inputs[first : first + count].T,
-            inputs[first + 1 : first + 1 + count].T, *(_repeated(c, count) for c in constants),
+            inputs[first + 1 : first + 1 + count].T, *repeated,
         )  # fmt: skip
         out[first + 1 : first + 1 + count] = np.asarray(block).T
     return out
-
-
-def _repeated(constant: Array, count: int) -> Array:
-    return np.tile(constant, count) if constant.ndim == 2 else constant
 
 
 class _Held:

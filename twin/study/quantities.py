@@ -114,7 +114,8 @@ def noise_quantities(
 def batch_quantities(batch: Sequence[BatchResult], over_slip: Sequence[BatchResult]) -> Quantities:
     """Tab. 3 and energy a metre."""
     mud = [r for r in batch if r.cell.terrain == "mud"]
-    on = {(r.cell.terrain, r.cell.friction): r for r in batch if _nominal(r)}
+    nominal = [r for r in batch if r.cell.slope_deg == SLIP_SLOPE_DEG and r.cell.payload_kg == 0.0]
+    on = {(r.cell.terrain, r.cell.friction): r for r in nominal}
     medium = [r.slip for (terrain, _), r in on.items() if terrain == "medium_sand"]
     numbers = {
         "mud.not_mobile": 100.0 * sum(not r.mobile for r in mud) / len(mud),
@@ -144,10 +145,6 @@ def _friction_factor(on: Mapping[tuple[str, float], BatchResult], terrain: str) 
     """Slip at the low end of a terrain's friction range over that at the high end."""
     low, high = FRICTION[terrain]
     return on[terrain, low].slip / on[terrain, high].slip
-
-
-def _nominal(result: BatchResult) -> bool:
-    return result.cell.slope_deg == SLIP_SLOPE_DEG and result.cell.payload_kg == 0.0
 
 
 def _less_friction_slips_more(lower: BatchResult, higher: BatchResult) -> bool:

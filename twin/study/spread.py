@@ -17,7 +17,6 @@ class Spread:
         mean: over the runs.
         half_width: the mean lies in mean -+ this with 95 % confidence (Student's t); NaN for one run.
         low, high: smallest and largest run.
-        runs: how many.
     """
 
     mean: float

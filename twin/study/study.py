@@ -60,7 +60,6 @@ class Study:
     """The reproduced study.
 
     Attributes:
-        plan: what was run.
         runs: by terrain, the three cases of Tab. 4 on even ground, one run a seed.
         uneven: the same on ground that varies.
         noisy: the same runs with Gaussian GNSS noise at `STUDY_LIKE_HZ` that waits for its size.
@@ -116,7 +115,8 @@ def run_study(
     batch = tuple(next(done) for _ in cells)
     over_slip = tuple(next(done) for _ in steps)
     field = tuple(done)
-    noise = tuple(_noise_at(rate_hz, runs) for rate_hz in RATES_HZ)
+    published = {case.terrain: case.gnss for case in CASES}
+    noise = tuple(fit_noise(_noisy(rate_hz, runs), published, rate_hz) for rate_hz in RATES_HZ)
     noisy = _noisy(STUDY_LIKE_HZ, runs)
     measured = (
         platform_quantities()
@@ -128,10 +128,6 @@ def run_study(
     )
     rows = judge(load_claims(), measured)
     return Study(plan, runs, uneven, noisy, noise, batch, over_slip, field, measured, rows)
-
-
-def _noise_at(rate_hz: float, runs: Mapping[str, Sequence[CaseRun]]) -> NoiseFit:
-    return fit_noise(_noisy(rate_hz, runs), {case.terrain: case.gnss for case in CASES}, rate_hz)
 
 
 def _noisy(rate_hz: float, runs: Mapping[str, Sequence[CaseRun]]) -> dict[str, tuple[NoisyRun, ...]]:

@@ -46,7 +46,6 @@ def run_sweep(
     """Compute the runs that `out` does not hold yet, and return the table of all.
 
     Args:
-        sweep: what to run.
         out: folder of the results, see the files above.
         jobs: processes on this machine; a Dask cluster has its own number.
         backend: "loky" (this machine) or "dask".

@@ -44,7 +44,6 @@ def opened_bag(
     """A bag of either ROS, open.
 
     Args:
-        path: the bag.
         open_container: opens the file or folder.
         remedy: what to do about a bag that does not open or breaks off.
 

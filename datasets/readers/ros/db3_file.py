@@ -29,7 +29,6 @@ class Db3File:
     """An open SQLite database of a ROS 2 bag.
 
     Args:
-        path: the file.
         counts: numbers of messages by topic where they are known; counting them takes a pass over the file.
 
     Raises:

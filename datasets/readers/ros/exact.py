@@ -80,7 +80,6 @@ def restore(
     Args:
         read: gives the streams of topics with the wanted fields.
         there: the topics of the bag.
-        file: the bag.
 
     Raises:
         DataError, ConfigError: the bag is not as this library writes it.

@@ -192,7 +192,6 @@ class MessageDecoder:
     """Gathers the messages of one topic as arrays.
 
     Attributes:
-        msgtype: type of its messages.
         types: fields of that type and of those it is made of.
         wanted: paths of the fields to keep, with all below them; () for all.
         cdr: whether messages are in CDR, not in ROS 1's serialisation.

@@ -70,7 +70,6 @@ def decode_streams(
     """The streams of topics, in one go over the file.
 
     Args:
-        container: the bag.
         asked: paths of the wanted fields by topic and type.
         enough: stop when one topic has so many messages.
     """

@@ -45,7 +45,6 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool,
         streams: by channel, in the order of the file.
         stamps: "header" or "receipt".
         repair_clock: take steps of the clock out, and sort messages out of order, instead of refusing.
-        file: for errors.
 
     Raises:
         DataError: stamps that run backwards, or header stamps that are zero in part.

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import TERRAINS, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError
@@ -114,14 +113,10 @@ def _pairing(rows: dict[str, NumberRows]) -> list[str]:
     notes.append(
         f"{imu.path.name} and {pro.path.name} are assumed to start together; they end {ends:.2f} s apart"
     )
-    even = [r.path.name for r in rows.values() if _is_even(r.t_ns)]
+    even = [r.path.name for r in rows.values() if len(r) > 2 and int(np.ptp(np.diff(r.t_ns))) <= EVEN_NS]
     if even:
         notes.append(
             f"times of {' and '.join(even)} are exactly even: counted from a nominal rate, not stamped; "
             "the two may drift apart"
         )
     return notes
-
-
-def _is_even(t_ns: NDArray[np.int64]) -> bool:
-    return len(t_ns) > 2 and int(np.ptp(np.diff(t_ns))) <= EVEN_NS

@@ -83,6 +83,7 @@ def read(request: Request) -> list[Recording]:
     rows, apart = _contemporaries(rows, given.kind)
     notes = [_joined(given, rows), *apart, *clock, *(note for r in rows.values() for note in r.notes)]
     truth, truth_notes = _truth(rows)
+    truth_kind = "center" if "center" in rows else "front"
     wheels, wheel_notes = _wheels(rows.get("wheels"), given.kind == "wheels")
     recording = Recording(
         name=name or request.path.resolve().parent.name,
@@ -92,7 +93,7 @@ def read(request: Request) -> list[Recording]:
         truth=truth,
         truth_channels=_truth_channels(rows, truth),
         clock_jumps=tuple(
-            replace(jump, channel="truth") if jump.channel == _truth_of(rows) else jump for jump in jumps
+            replace(jump, channel="truth") if jump.channel == truth_kind else jump for jump in jumps
         ),
         notes=(*notes, *truth_notes, *wheel_notes),
     )
@@ -237,10 +238,6 @@ def _gaps(t_ns: NDArray[np.int64]) -> list[str]:
     lost = int(np.round(gaps / period_s - 1.0).sum())
     share = lost / (len(t_ns) + lost)
     return [f"{lost} frames lost ({share:.1%}) in {gaps.size} gaps, the longest {gaps.max():.2f} s"]
-
-
-def _truth_of(rows: dict[str, NumberRows]) -> str:
-    return "center" if "center" in rows else "front"
 
 
 def _front_note(center: Trajectory, front: Trajectory) -> str:

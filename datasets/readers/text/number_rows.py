@@ -31,7 +31,6 @@ class NumberRows:
     """What a file holds.
 
     Attributes:
-        path: the file.
         t_ns: (N,) int64, as written, in the order of the lines.
         values: (N, k) of the other columns, all finite.
         lines: (N,) line numbers where no line is blank.
@@ -63,9 +62,7 @@ def read_rows(
     """Read a file whose first column is time in seconds.
 
     Args:
-        path: the file.
         columns: names of all its columns, the time first.
-        separator: what stands between numbers.
         header: whether the first line names the columns, in any order.
 
     Raises:
