@@ -147,6 +147,16 @@ def test_pages_are_few_words() -> None:
     assert words <= 40_000
 
 
+def test_the_tests_that_a_page_names_exist() -> None:
+    named = {
+        name
+        for page in (ROOT / "docs").rglob("*.md")
+        for name in re.findall(r"`(tests/[\w/]+\.py)`", page.read_text(encoding="utf-8"))
+    }
+    assert len(named) >= 10
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs" / "img").iterdir())
     assert pictures

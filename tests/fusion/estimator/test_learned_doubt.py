@@ -126,6 +126,33 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
     assert learned._untouched(driving.chain, learned.calibration) is sure
 
 
+def test_learning_begins_again_from_what_was_known_before_a_wrong_heading(
+    driving: Estimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned, begun = driving.learned, list[Knowledge | None]()
+    assert learned.calibration is not None
+    monkeypatch.setattr(learned.calibration, "restart", begun.append)
+    monkeypatch.setattr(learned, "_known", dataclasses.replace(learned._known, slip_spread=0.3))
+    monkeypatch.setattr(learned, "_past", learned._past.copy())
+    learned.heading_turned()
+    assert begun == [learned.calibration.before]
+    assert learned._known is learned.calibration.before
+    assert not learned._past
+
+
+def test_numbers_known_before_the_drive_explain_no_slide(
+    driving: Estimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned, mean = driving.learned, driving.learned._before.mean.copy()
+    mean[ANTENNA_X] += 0.5
+    known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0)
+    assert learned.calibration is not None
+    for holder, name in ((learned, "_before"), (learned.calibration, "known")):
+        monkeypatch.setattr(holder, name, known)
+    monkeypatch.setattr(learned.calibration, "misfit", 2.0)
+    assert not learned._explained(learned.calibration)
+
+
 @pytest.mark.parametrize(
     ("number", "off", "misfit", "explained"),
     [
