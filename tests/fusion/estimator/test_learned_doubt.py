@@ -25,6 +25,7 @@ from terrafusion.fusion.estimator.learned_numbers import (
     _doubt_place,
     with_turn_doubt,
 )
+from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -138,6 +139,17 @@ def test_learning_begins_again_from_what_was_known_before_a_wrong_heading(
     assert begun == [learned.calibration.before]
     assert learned._known is learned.calibration.before
     assert not learned._past
+
+
+def test_the_height_of_a_fix_says_nothing_of_its_place(
+    driving: Estimator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = list[float]()
+    monkeypatch.setattr(
+        driving.learned.calibration, "fix", lambda t_ns, enu_m, sigma_m: taken.append(sigma_m)
+    )
+    driving.learned.fix(GnssFix(1, np.zeros(3), np.array([0.02, 0.03, 5.0])))
+    assert taken == [0.03]
 
 
 def test_numbers_known_before_the_drive_explain_no_slide(

@@ -266,7 +266,8 @@ def places(d, lever_m=(0.0, 0.0, 0.0), late_s=0.0, from_s=20.0):
     ("antenna", "value"),
     [
         ({"lever_m": (0.3, 0.0, 0.0)}, "doubtful"),
-        ({"lever_m": (0.1, 0.0, 0.0)}, "good"),
+        ({"lever_m": (0.16, 0.0, 0.0)}, "doubtful"),
+        ({"lever_m": (0.14, 0.0, 0.0)}, "good"),
         ({"lever_m": (0.3, 0.0, 0.0), "from_s": 0.5}, "good"),
         ({"late_s": 0.5}, "doubtful"),
         ({"late_s": 0.05}, "good"),
