@@ -215,10 +215,11 @@ class DeadReckoning:
         """
         begin = max(len(self.pairs) - SCATTER_FIXES, 0)
         recent = self.pairs[begin:]
-        taken = list(range(begin, len(self.pairs)))
-        if not any(_mostly_alone(pairs) for pairs in (recent, recent[-LEAST_FIXES:])):
-            taken = [i for i, pair in enumerate(recent, begin) if not pair.alone]
-        if len(taken) < LEAST_FIXES:
+        taken: slice | list[int] = slice(begin, None)
+        supported = [i for i, pair in enumerate(recent, begin) if not pair.alone]
+        if len(supported) < len(recent) and not any(map(_mostly_alone, (recent, recent[-LEAST_FIXES:]))):
+            taken, recent = supported, recent[: len(supported)]
+        if len(recent) < LEAST_FIXES:
             return math.nan
         squares, bend, reported = self._second_differences(taken)
         if len(squares) < 6:

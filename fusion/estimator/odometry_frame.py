@@ -15,7 +15,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import key_state_of
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import KeyState, quaternion_of
+from terrafusion.fusion.graph.key_state import POSE, quaternion_of
 from terrafusion.fusion.graph.triangular import back_substitute
 
 
@@ -38,7 +38,7 @@ class OdometryFrame:
 
     def step(self, chain: Chain) -> None:
         """Take the newest keyframe, solved without the fixes that came with it."""
-        before = _smoothed_before(chain).pose
+        before = _smoothed_before(chain)
         begin = before if self._pose is None else self._pose
         self._pose = begin.compose(before.between(chain.state(chain.last).pose))
 
@@ -62,8 +62,8 @@ class OdometryFrame:
         )
 
 
-def _smoothed_before(chain: Chain) -> KeyState:
-    """The keyframe before the newest, as the newest solution has it: `Chain.solve` moves the newest alone.
+def _smoothed_before(chain: Chain) -> gtsam.Pose3:
+    """Pose of the keyframe before the newest by the newest solution: `Chain.solve` moves the newest alone.
 
     A change of ground that is detected late moves both; their difference alone is the motion between them.
     """
@@ -71,4 +71,4 @@ def _smoothed_before(chain: Chain) -> KeyState:
     assert node.conditional is not None
     following = node.conditional[:, dim : 2 * dim] @ chain.nodes[-1].delta
     delta = back_substitute(node.conditional[:, :dim], node.conditional[:, 2 * dim] - following)
-    return node.point.retract(delta)
+    return node.point.pose.retract(delta[POSE])

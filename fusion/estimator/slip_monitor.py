@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,8 +67,9 @@ class MotionMonitor:
         self._stamp_m = 0.5 * 1.0 / rig.sensors.wheels.rate_hz**2
         self.slipping = False
         self.cause: str | None = None
-        # Between keyframes: time, wheel travel (NaN: unknown), estimated travel, its sigma, size of command.
-        self._steps: deque[tuple[float, ...]] = deque()
+        # Between keyframes (n, 5), the newest first: time, wheel travel (NaN: unknown), estimated travel, its
+        # sigma, size of command.
+        self._steps: Array | None = None
         self._command: tuple[int, float] | None = None
         self._t_ns: int | None = None
         self._agreed_s = 0.0
@@ -102,9 +102,9 @@ class MotionMonitor:
         mean_mps = 0.5 * (self._speed_mps + speed_mps)
         self._speed_mps = speed_mps
         rolled = math.nan if rolled_m is None else rolled_m
-        self._steps.append((dt, rolled, mean_mps * dt, sigma_mps * dt, abs(self._commanded(t_ns))))
-        while len(self._steps) * dt > WINDOWS_S[-1] + 2.0 * dt:
-            self._steps.popleft()
+        step = np.array([[dt, rolled, mean_mps * dt, sigma_mps * dt, abs(self._commanded(t_ns))]])
+        kept = int((WINDOWS_S[-1] + 2.0 * dt) / dt)
+        self._steps = step if self._steps is None else np.concatenate([step, self._steps])[:kept]
         stuck, *windows = self.travels(STUCK_S, *WINDOWS_S)
         self._watch_slip(windows, dt)
         self.cause = None if stuck is None else self._cause(stuck)
@@ -118,8 +118,9 @@ class MotionMonitor:
 
         Errors of the estimated speed outlast a window: their sigmas add up.
         """
-        newest_first = np.array(list(self._steps)).reshape(-1, 5)[::-1]
-        sums = np.cumsum(newest_first[:, :4], axis=0)
+        if self._steps is None:
+            return [None] * len(windows_s)
+        sums = np.cumsum(self._steps[:, :4], axis=0)
         seconds = sums[:, 0].tolist()
         found: list[Travel | None] = []
         for window_s in windows_s:
@@ -129,7 +130,7 @@ class MotionMonitor:
                 continue
             total, rolled, moved, sigma = sums[last].tolist()
             noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
-            found.append(Travel(total, rolled, moved, noise, float(newest_first[: last + 1, 4].min())))
+            found.append(Travel(total, rolled, moved, noise, float(self._steps[: last + 1, 4].min())))
         return found
 
     def _commanded(self, t_ns: int) -> float:

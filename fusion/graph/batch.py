@@ -16,7 +16,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.graph.keyframe_rows import carried_prior
+from terrafusion.fusion.graph.keyframe_rows import carried_prior, insert
 from terrafusion.fusion.graph.triangular import (
     back_substitute,
     back_substitute_before,
@@ -44,10 +44,8 @@ class BatchSmoother:
         self.dim, self.first, self.size = chain.dim, chain.first, len(nodes)
         self._keys = [(X(k), V(k), B(k)) for k in range(self.first, self.first + self.size)]
         self.values = gtsam.Values()
-        for (x, v, b), point in zip(self._keys, points, strict=True):
-            self.values.insert(x, point.pose)
-            self.values.insert(v, point.velocity)
-            self.values.insert(b, point.bias)
+        for k, point in enumerate(points, self.first):
+            insert(self.values, k, point)
         self.linear = np.array([point.linear for point in points])
         self.iterations = 0
         self._blocks = [

@@ -27,7 +27,14 @@ from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, NAV, POSE, VELOCITY, KeyState, dim_of
-from terrafusion.fusion.graph.keyframe_rows import SYMBOLS, carried_prior, link_rows, measured_rows, own_rows
+from terrafusion.fusion.graph.keyframe_rows import (
+    SYMBOLS,
+    carried_prior,
+    insert,
+    link_rows,
+    measured_rows,
+    own_rows,
+)
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import (
     back_substitute,
@@ -293,9 +300,7 @@ class Chain:
         """Insert the variables of the keyframes that GTSAM does not have yet."""
         self._inserted = max(self._inserted, self.first)
         for k, node in enumerate(self.nodes[self._inserted - self.first :], self._inserted):
-            self.values.insert(X(k), node.point.pose)
-            self.values.insert(V(k), node.point.velocity)
-            self.values.insert(B(k), node.point.bias)
+            insert(self.values, k, node.point)
         self._inserted = self.last + 1
 
     def _carry_prior(self) -> None:
@@ -342,9 +347,9 @@ class Chain:
     def _publish(self, k: int) -> None:
         self._insert_new()
         node = self.nodes[k - self.first]
-        self.values.update(X(k), node.point.pose)
-        self.values.update(V(k), node.point.velocity)
-        self.values.update(B(k), node.point.bias)
+        self.values.update(X(k), pose3=node.point.pose)
+        self.values.update(V(k), vector=node.point.velocity)
+        self.values.update(B(k), constant_bias=node.point.bias)
 
     def _stacked(self, k: int) -> Array:
         """Prior and all whitened rows over keyframes k and k + 1, shape (m, 2 dim + 1)."""

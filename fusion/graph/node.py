@@ -38,35 +38,39 @@ class Node:
     velocities: list[GnssVelocity] = field(default_factory=list)
     conditional: Array | None = None
 
+    def __post_init__(self) -> None:
+        # Results that hold while what they were made of does. They are no fields: a snapshot leaves them out.
+        self._state: tuple[KeyState, Array, KeyState] | None = None
+        self._rows: tuple[KeyState, list[Array]] | None = None
+        self._link_rows: tuple[tuple[object, ...], Array] | None = None
+
     def state(self) -> KeyState:
         """The estimate: `point` moved by `delta`."""
-        # Beside the fields, so that a snapshot does not write it; made anew where either of the two changed.
-        held: tuple[KeyState, Array, KeyState] | None = vars(self).get("_held")
+        held = self._state
         if held is None or held[0] is not self.point or held[1] is not self.delta:
-            held = vars(self)["_held"] = self.point, self.delta, self.point.retract(self.delta)
+            held = self._state = self.point, self.delta, self.point.retract(self.delta)
         return held[2]
 
     def held_rows(self) -> list[Array] | None:
         """What `hold_rows` got, while it is true: until the linearisation point or a factor is another."""
-        held: tuple[KeyState, list[Array]] | None = vars(self).get("_rows")
-        return held[1] if held is not None and held[0] is self.point else None
+        return self._rows[1] if self._rows is not None and self._rows[0] is self.point else None
 
     def hold_rows(self, rows: list[Array]) -> list[Array]:
-        """Keep the whitened rows of its own factors, beside the fields."""
-        vars(self)["_rows"] = self.point, rows
+        """Keep the whitened rows of its own factors."""
+        self._rows = self.point, rows
         return rows
 
     def held_link(self, made_of: tuple[object, ...]) -> Array | None:
         """The whitened rows of its link, while what they were made of is the same."""
-        held: tuple[tuple[object, ...], Array] | None = vars(self).get("_link")
+        held = self._link_rows
         same = held is not None and all(map(operator.is_, held[0], made_of))
         return held[1] if held is not None and same else None
 
     def hold_link(self, made_of: tuple[object, ...], rows: Array) -> Array:
-        """Keep the whitened rows of its link, beside the fields."""
-        vars(self)["_link"] = made_of, rows
+        """Keep the whitened rows of its link."""
+        self._link_rows = made_of, rows
         return rows
 
     def forget_rows(self) -> None:
         """A factor of its own changes."""
-        vars(self).pop("_rows", None)
+        self._rows = None

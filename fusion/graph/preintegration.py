@@ -46,7 +46,8 @@ class Preintegrator:
 
         With a replaced spike the sensor's noise is inflated by `HELD_INFLATION`.
         """
-        noise = _less_sure(noise, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
+        held = any(p.gyro_held for p in segments), any(p.accel_held for p in segments)
+        noise = _less_sure(noise, *held) if any(held) else noise
         # Steps of 5 % keep the number of parameter sets small.
         inflations = *noise.gyro_axes(), noise.accel_inflation
         key = tuple(round(math.log(inflation) / STEP) for inflation in inflations)
