@@ -5,7 +5,8 @@ good fixes out and lead the estimate astray again after each that is let in. But
 no further than its wheels rolled and its speed carried it since the last used fix. Rejected fixes that lie
 on one side of the estimate and within that reach refute the wheels, not the receiver. The variance that
 explains them (a random walk, m2 per second of driving) is kept and adapted by the innovations of accepted
-fixes (Mehra 1972, IEEE T-AC 17(5)).
+fixes (Mehra 1972, IEEE T-AC 17(5)). The wheels have led the velocity astray, too: it is in doubt by what
+carries the robot to the rejected fixes.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.friction import FrictionEstimator
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -35,6 +36,8 @@ FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
 COARSE_M2 = 1.0
 """Variance of a fix, both axes, that tells little of a skid: .7 m each (assumed)."""
+LEAST_GAP_S = 0.1
+"""Time from the last used fix over which a velocity carries the robot to a rejected one, at least."""
 DRIVING_MPS = 0.3
 """Speed, of the robot or its wheels, at which half of the time counts as driven; at rest none does."""
 
@@ -68,12 +71,12 @@ class SkidDetector:
         sigma_m: float,
         noise: SensorNoise,
     ) -> bool:
-        """Whether rejected fixes, the last at keyframe k, refute the wheels; inflates their variance if so.
+        """Whether rejected fixes, the last at keyframe k, refute the wheels; doubts wheels and velocity then.
 
-        It takes two rejected fixes in a row, in a skid one.
+        It takes two rejected fixes in a row; one in a skid, where it is larger than its rate explains.
 
         Args:
-            chain: its wheel increments from `since_ns` to k are inflated.
+            chain: the past before `since_ns` is cut off; its wheel increments from there to k are inflated.
             k: keyframe of the newest rejected fix.
             since_ns: time of the last fix used.
             refused: offsets (2,), m, of the consecutive rejected fixes from the estimate.
@@ -98,16 +101,22 @@ class SkidDetector:
         off_m = float(np.linalg.norm(refused[-1]))
         if off_m > sum(rolled_m) + fastest_mps * float(sum(steps_s)) + REACH_SIGMA * sigma_m:
             return False
-        more_m2ps = 0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps
-        if more_m2ps <= 0.0:
+        more_m2ps = max(0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps, 0.0)
+        if len(refused) > 1:
+            doubt = np.zeros(chain.dim)
+            doubt[VELOCITY][:2] = (off_m / max(float(sum(steps_s)), LEAST_GAP_S)) ** 2
+            chain.restart(doubt, begin)
+        elif more_m2ps == 0.0:
             return False
         self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in zip(passed, nodes, strict=True)]
         self.rate_m2ps += more_m2ps
         self.refutations += 1
-        for i, node, driven in zip(passed, nodes, driven_s, strict=True):
+        # Over all of the time: wheels that are locked do not say when a robot stops.
+        m2ps = more_m2ps * sum(driven_s) / max(float(sum(steps_s)), 1e-9)
+        for i, node, dt_s in zip(passed, nodes, steps_s.tolist(), strict=True):
             if node.wheels is not None:
-                inflated = self.friction.inflated_link(chain, i, more_m2ps, noise) if self.friction else None
-                chain.revise(i, wheels=node.wheels.with_extra_variance(more_m2ps * driven), link=inflated)
+                inflated = self.friction.inflated_link(chain, i, m2ps, noise) if self.friction else None
+                chain.revise(i, wheels=node.wheels.with_extra_variance(m2ps * dt_s), link=inflated)
         chain.smooth(chain.last - begin + 1)
         return True
 
