@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -44,18 +44,6 @@ EFFECTS = {
 SPREAD = 0.05
 """1 sigma of the ground's strength from run to run, of the typical size of its parameters."""
 GROUND = ("soil_strength/shear", "soil_strength/bearing")
-
-
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a rate (Wilson 1927)."""
-    if count == 0:
-        return 0.0, 1.0
-    z, rate = 1.96, hits / count
-    middle, half = (
-        rate + z * z / (2 * count),
-        z * math.sqrt(rate * (1 - rate) / count + (z / (2 * count)) ** 2),
-    )
-    return (middle - half) / (1 + z * z / count), (middle + half) / (1 + z * z / count)
 
 
 def drive(
@@ -138,7 +126,7 @@ def main() -> int:
         ("detected", sum(one["detected"] for _, one in changed), len(changed)),
         ("right effect in a named class", sum(key in one["class"] for key, one in changed), len(changed)),
     ):
-        low, high = wilson(hits, of)
+        low, high = Rate(hits, of).interval()
         print(f"{name} {hits} of {of} ({low:.2f} to {high:.2f})")
     print(f"CPU time a diagnosis, median {np.median([one['seconds'] for one in found]):.1f} s")
     covered = [one["covered"] for one in found if one["covered"] is not None]

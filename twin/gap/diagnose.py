@@ -9,9 +9,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
@@ -33,8 +31,6 @@ from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
 STRICTER = 0.2

@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
@@ -30,8 +31,6 @@ from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, li
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
-
-Array = NDArray[np.float64]
 
 BY_HAND = "measurement by hand"
 SEPARABLE_SIGMAS = 3.0  # sigmas by which a drive must distinguish two effects

@@ -9,16 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.answer.verdict import EffectFit
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
-
-Array = NDArray[np.float64]
 
 METRIC = "mean squared whitened error with soil, offsets and pose adapted, on runs left out of the fit"
 ABOVE_FLOOR = 3.0  # a share is given where the gap is so many standard deviations of the floor above it

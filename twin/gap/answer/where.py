@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.answer.shrinkage import own_error, without_states
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
-from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_twist
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_acceleration, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
-
-Array = NDArray[np.float64]
 
 REGIMES = (
     ("standing", lambda v, r, a: np.abs(v) + 0.3 * np.abs(r) < 0.02),
@@ -33,7 +32,6 @@ REGIMES = (
 holds."""
 BANDS = ("below 0.5 Hz", "above 0.5 Hz")
 SLOW_S = 2.0  # means over this interval are the slow band
-ACCELERATION_SAMPLES = 51  # grid samples over which the acceleration is averaged: half a second
 LEAST_SAMPLES = 5
 PERMUTATIONS = 99  # most other choices of runs that the judged ones are compared with
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
@@ -65,10 +63,8 @@ class GapCell:
 def regimes(run: WhitenedRun, model: Model) -> NDArray[np.int64]:
     """Index (n,) of the regime of each sample."""
     t_s, twist = commanded_twist(run.log, model)
-    width = ACCELERATION_SAMPLES
-    rate = np.pad(np.gradient(twist[:, 0], t_s), width // 2, mode="edge")
-    rate = np.convolve(rate, np.ones(width) / width, mode="valid")
-    v, r, a = (np.interp(run.time_s, t_s, x) for x in (twist[:, 0], twist[:, 1], rate))
+    columns = (twist[:, 0], twist[:, 1], commanded_acceleration(twist[:, 0]))
+    v, r, a = (np.interp(run.time_s, t_s, column) for column in columns)
     out = np.full(len(run.time_s), len(REGIMES) - 1)
     for i in reversed(range(len(REGIMES))):
         out[np.asarray(REGIMES[i][1](v, r, a))] = i

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog
@@ -24,8 +24,6 @@ from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
 from terrafusion.twin.model.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
 PRIOR = 3.0  # 1 sigma of every parameter in typical sizes: bounds what the data leave open

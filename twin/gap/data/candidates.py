@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import catalogue, effect_names, lookup, moves, parameters
 from terrafusion.twin.effects.form import Form
-
-Array = NDArray[np.float64]
 
 SOIL_STRENGTH = "soil_strength"
 """The effect that is a known parameter of the soil, not missing physics: verdict `parameters`."""

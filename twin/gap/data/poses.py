@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
-
-Array = NDArray[np.float64]
 
 EAST_NORTH = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
 """Channels of positions (rotated and shifted) and of velocities (rotated only)."""

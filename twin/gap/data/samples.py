@@ -8,12 +8,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import averaging
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 COARSE_STEP = 5  # derivatives are stored at every n-th sample of the run: they enter as weights only

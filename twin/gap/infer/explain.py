@@ -164,7 +164,6 @@ def explain(
     *,
     close: bool,
     without: Collection[str] = (),
-    bank: SignatureBank | None = None,
 ) -> Explanation:
     """Log evidence of sets of effects.
 
@@ -175,7 +174,7 @@ def explain(
         without: effects, or forms of them (effect/form), that are left out.
     """
     own = _Explainer(evidence, sigma, robot, without)
-    bank = SignatureBank.of(evidence, simulate=close) if bank is None else bank
+    bank = SignatureBank.of(evidence, simulate=close)
     runs, m, laws = own.look(bank)
     alone = {i: laws.fit(m, (i,)) for i in own.allowed(laws)}
     if not close:

@@ -7,14 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import whitened_error
 from terrafusion.twin.gap.rollout.run_soil import referred_to_model, with_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
-
-Array = NDArray[np.float64]
 
 
 def effects_at(evidence: GapEvidence, columns: Sequence[int], value: Array) -> dict[str, float]:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, gauss_markov
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import Indices, sample_map
@@ -19,7 +19,6 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened_columns,
 )
 
-Array = NDArray[np.float64]
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
 ANY_SIZE = 30.0  # 1 sigma of effects, in typical sizes, in a run without references (assumed)

@@ -11,18 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.rollout.nuisance import commanded_twist
+from terrafusion.twin.gap.rollout.nuisance import commanded_acceleration, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
-
-Array = NDArray[np.float64]
 
 SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2 = 0.3, 0.3, 0.6
 """Width of a cell; the middle one is centred on zero."""
-SMOOTH_SAMPLES = 51  # grid samples over which the acceleration is averaged: half a second
 LEAST_S = 1.0  # time of all references in a cell from which it counts as covered
 MOST_LISTED = 4
 LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
@@ -47,9 +44,7 @@ class DriveCoverage:
 
 def time_by_cell(twist: Array) -> Seconds:
     """Seconds by cell of commanded speed, turn rate and acceleration; `twist` is (N, 2), m/s and rad/s."""
-    kernel = np.ones(SMOOTH_SAMPLES) / SMOOTH_SAMPLES
-    rate = np.pad(np.gradient(twist[:, 0], DT_S), SMOOTH_SAMPLES // 2, mode="edge")
-    columns = np.stack([twist[:, 0], twist[:, 1], np.convolve(rate, kernel, mode="valid")], axis=1)
+    columns = np.column_stack([twist, commanded_acceleration(twist[:, 0])])
     index = np.round(columns / [SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2]).astype(np.int64)
     low, sides = index.min(axis=0), tuple((np.ptp(index, axis=0) + 1).tolist())
     number, count = np.unique(np.ravel_multi_index(tuple((index - low).T), sides), return_counts=True)

@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
@@ -30,8 +28,6 @@ from terrafusion.twin.gap.rollout.residuals import (
 from terrafusion.twin.gap.rollout.run_soil import at_run_soil, soil_limit
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,25 +94,21 @@ def gather_evidence(
 
     residuals = all_residuals(logs, linearised, channels, jobs, count)
     first = learn_noise(residuals[R:], residuals[:R], candidates, jobs)
-    free = at_run_soil(residuals[R:], linearised, first, jobs=jobs)
-    limit = soil_limit(free, candidates)
-    # The same limit for all, or a run that is but a further reference would differ from them.
+    free = at_run_soil(residuals, linearised, first, jobs=jobs)
+    limit = soil_limit(free[R:], candidates)
+    # The same search for all, or a run that is but a further reference would differ from them.
     beyond = [not (abs(run.soil) <= limit).all() for run in free]
-    again = [*residuals[:R], *itertools.compress(residuals[R:], beyond)]
-    limited = iter(at_run_soil(again, linearised, first, limit, jobs))
-    judged = list(itertools.islice(limited, R))
-    normal = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
-    noise = learn_noise(normal, judged, candidates, jobs, first)
+    limited = iter(at_run_soil([*itertools.compress(residuals, beyond)], linearised, first, limit, jobs))
+    every = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
+    noise = learn_noise(every[R:], every[:R], candidates, jobs, first)
     with ThreadPoolExecutor(jobs) as threads:
-        every = [*judged, *normal]
         errors = list(threads.map(lambda run: whitened(run.errors_alone(), noise), every))
         usual = reference_loudness(errors[R:])
         every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
         white = list(threads.map(lambda run: whitened(run, noise), every))
-    judged, normal = every[:R], every[R:]
     clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
-        model, candidates, channels, noise, *clipped, judged, normal, limit, linearised,
+        model, candidates, channels, noise, *clipped, every[:R], every[R:], limit, linearised,
         tuple(dict.fromkeys(notes)), jobs,
     )  # fmt: skip

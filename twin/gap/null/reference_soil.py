@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
@@ -23,9 +23,8 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened,
     whitened_error,
 )
+from terrafusion.twin.gap.rollout.run_soil import with_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
-
-Array = NDArray[np.float64]
 
 RUNS, STEPS = 3, 5  # references that are used, and most steps of the search
 LEAST_STEP, MOST_STEP = 0.1, 1.0
@@ -80,7 +79,8 @@ def set_soil(
     for _ in range(STEPS):
         if np.abs(step).max(initial=0.0) < LEAST_STEP:
             break
-        rollouts = [Rollout(run.log, _soil_effects(at + step, soil, candidates, model)) for run in runs]
+        tried, _ = with_run_soil(at + step, cache, {})
+        rollouts = [Rollout(run.log, tried) for run in runs]
         predicted = aligned_predictions(rollouts, model, candidates, jobs)
         now = [
             whitened_error(
@@ -94,17 +94,7 @@ def set_soil(
             step = next_step()
         else:
             step = SHORTER * step
-    effects = {**model.effects, **_soil_effects(at, soil, candidates, model)}
-    return dataclasses.replace(model, effects=effects)
-
-
-def _soil_effects(at: Array, soil: Sequence[int], candidates: Candidates, model: Model) -> dict[str, float]:
-    """Soil parameters `at` (S,) typical sizes from the model's own, within their ranges."""
-    out = {}
-    for i, d in zip(soil, at, strict=True):
-        value = model.effects.get(candidates.keys[i], 0.0) + float(d * candidates.scale[i])
-        out[candidates.keys[i]] = float(np.clip(value, 0.95 * candidates.low[i], 0.95 * candidates.high[i]))
-    return out
+    return dataclasses.replace(model, effects={**model.effects, **with_run_soil(at, cache, {})[0]})
 
 
 def _square(errors: Sequence[Array]) -> float:

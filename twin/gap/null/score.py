@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
-
-Array = NDArray[np.float64]
 
 EM_STEPS = 6
 PRIOR_RUNS = 3.0  # weight of the assumed variance of theta, in runs
@@ -24,12 +22,10 @@ REPLICATES = 20  # twin replicates that stand in for references
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score b (P,) and information A (P, P) of one run, and the sum of squares that theta leaves."""
+    """Score b (P,) and information A (P, P) of one run."""
 
     b: Array
     A: Array
-    square: float
-    samples: int
 
 
 def score(run: WhitenedRun, sigma: Array) -> Score:
@@ -37,16 +33,7 @@ def score(run: WhitenedRun, sigma: Array) -> Score:
     T, G = run.states, run.gram
     solved = np.linalg.solve(run.state_information(sigma), G[:T, T:])
     rest = G[T:, T:] - G[:T, T:].T @ solved
-    return Score(rest[:-1, -1].copy(), rest[:-1, :-1].copy(), float(rest[-1, -1]), len(run.time_s))
-
-
-def score_of_error(run: WhitenedRun, sigma: Array, error: Array, A: Array) -> Score:
-    """The score of another whitened error (n,) of the run, with its information A."""
-    T = run.states
-    inner = run.rows[:, :-1].astype(float).T @ error
-    solved = np.linalg.solve(run.state_information(sigma), inner[:T])
-    b = inner[T:] - run.gram[T:-1, :T] @ solved
-    return Score(b, A, float(error @ error - inner[:T] @ solved), len(error))
+    return Score(rest[:-1, -1].copy(), rest[:-1, :-1].copy())
 
 
 def replicates(
@@ -66,7 +53,10 @@ def replicates(
         error += run.without_poses(rng.standard_normal(len(run.time_s)))
         if offset is not None:
             error += run.by_parameter @ offset
-        out.append(score_of_error(run, sigma, error, score(run, sigma).A))
+        inner = run.rows[:, :-1].astype(float).T @ error
+        solved = np.linalg.solve(run.state_information(sigma), inner[: run.states])
+        b = inner[run.states :] - run.gram[run.states : -1, : run.states] @ solved
+        out.append(Score(b, score(run, sigma).A))
     return out
 
 

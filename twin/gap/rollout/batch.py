@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
@@ -33,7 +33,6 @@ from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, W
 from terrafusion.twin.scenario.commands import delayed_inputs
 from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 
-Array = NDArray[np.float64]
 Effects = Mapping[str, float]
 MotionEffects = tuple[tuple[str, float], ...]  # effects of a set that change the motion, with their values
 

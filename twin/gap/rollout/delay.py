@@ -9,15 +9,13 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import LEAD_S, averaging
 from terrafusion.twin.effects.sensing import CLOCK_S
 from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map, window_starts
-
-Array = NDArray[np.float64]
 
 IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")

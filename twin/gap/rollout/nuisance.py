@@ -7,19 +7,18 @@ any kind shows as some dependence of the residuals on the input.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 
-Array = NDArray[np.float64]
-
 BASIS = (
     "constant", "speed", "turn_rate", "acceleration", "turn_acceleration", "speed2", "abs_turn", "lateral",
 )  # fmt: skip
 SMOOTH_S = 0.2  # interval over which rates of the commands are taken
+ACCELERATION_SAMPLES = 51  # grid samples over which an acceleration is averaged
 NORTH_OF = {"gnss_east_m": "gnss_north_m", "gnss_v_e_mps": "gnss_v_n_mps"}
 """North channel by east channel: for these the functions act along and across the robot's heading."""
 CHANNEL_NAMES = {
@@ -44,6 +43,12 @@ def commanded_twist(log: PreparedLog, model: Model) -> tuple[Array, Array]:
     left, right = log.sides.T * odometry.wheel_radius_m
     t_s: Array = DT_S * np.arange(float(len(log.sides)))
     return t_s, np.stack([0.5 * (left + right), (right - left) / odometry.track_m], axis=1)
+
+
+def commanded_acceleration(speed_mps: Array) -> Array:
+    """Acceleration (N,), m/s2, of commanded speeds (N,) of the grid, averaged over half a second."""
+    rate = np.pad(np.gradient(speed_mps, DT_S), ACCELERATION_SAMPLES // 2, mode="edge")
+    return np.convolve(rate, np.ones(ACCELERATION_SAMPLES) / ACCELERATION_SAMPLES, mode="valid")
 
 
 def command_basis(log: PreparedLog, model: Model, at_s: Array) -> Array:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.rollout.residuals import (
     OUTLIER_SIGMAS,
     ROBUST_STEPS,
@@ -20,8 +20,6 @@ from terrafusion.twin.gap.rollout.residuals import (
     clip_outliers,
     explained_by_states,
 )
-
-Array = NDArray[np.float64]
 
 HEAVY_TAILED = 0.02
 """A channel is clipped where more than this share of the references' errors exceeds the limit."""

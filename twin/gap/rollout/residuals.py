@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
@@ -32,8 +33,6 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     moved_to,
 )
 from terrafusion.twin.model.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
 
 SOIL_SIGMAS = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
 """Soil parameters that vary from run to run, with their first 1 sigma in typical sizes (assumed)."""

@@ -11,8 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, Candidates
 from terrafusion.twin.gap.rollout.residuals import (
@@ -26,13 +26,14 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 
-Array = NDArray[np.float64]
-
 MOST_SOIL = 4.0  # limit of a run's soil, in typical sizes from the model's
 LIMIT_SIGMAS = 3.0
 """A run's soil is also limited to so many sigmas of the references' soils: what goes beyond is a gap."""
-STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
-"""Steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
+STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
+"""Most steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
+SHORTER, LEAST_STEP = 0.4, 0.1
+"""Factor of a step that did not reduce the errors, and the least share of one: a full step goes too far where
+slip grows steeply, and a run that stays where it is would seem to be on the references' soil."""
 EFFECT_SIGMA = 0.3  # 1 sigma of the effects, in typical sizes, while a run's soil is sought
 
 
@@ -46,21 +47,23 @@ class _SoilSearch:
     errors: list[Array]
     cost: float
     gradient: Array
+    share: float = 1.0  # of a full step
     going: bool = True
 
     def accept_if_better(
         self, soil: Array, predicted: Sequence[Array] | None, noise: Mapping[str, ResidualNoise]
     ) -> None:
-        self.going = False
-        if predicted is None:
-            return
-        error = [o.value - y for o, y in zip(self.run.log.observed, predicted, strict=True)]
-        white = whitened_error(self.run, self.white, noise, error)
-        now, before = float(white @ white), self.cost
-        if now < before:
-            self.gradient = self.white.rows[:, :-1].astype(float).T @ white
-            self.soil, self.errors, self.cost = soil, error, now
-            self.going = ENOUGH * before >= now >= GOOD * len(self.white.time_s)
+        if predicted is not None:
+            error = [o.value - y for o, y in zip(self.run.log.observed, predicted, strict=True)]
+            white = whitened_error(self.run, self.white, noise, error)
+            now, before = float(white @ white), self.cost
+            if now < before:
+                self.gradient = self.white.rows[:, :-1].astype(float).T @ white
+                self.soil, self.errors, self.cost = soil, error, now
+                self.going = ENOUGH * before >= now >= GOOD * len(self.white.time_s)
+                return
+        self.share *= SHORTER
+        self.going = self.share >= LEAST_STEP
 
 
 def at_run_soil(
@@ -81,7 +84,7 @@ def at_run_soil(
         return _SoilSearch(run, white, run.soil, run.error, float(white.gram[-1, -1]), white.gram[:-1, -1])
 
     def next_soil(search: _SoilSearch) -> tuple[dict[str, float], Array]:
-        step = _soil_step(search.white, search.gradient, cache.candidates, len(search.soil))
+        step = search.share * _soil_step(search.white, search.gradient, cache.candidates, len(search.soil))
         return with_run_soil(np.clip(search.soil + step, -limit, limit), cache, {})
 
     with ThreadPoolExecutor(jobs) as threads:

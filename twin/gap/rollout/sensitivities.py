@@ -8,8 +8,8 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
@@ -36,8 +36,6 @@ from terrafusion.twin.gap.rollout.batch import (
 )
 from terrafusion.twin.gap.rollout.delay import delayed_samples, without_delays
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
-
-Array = NDArray[np.float64]
 
 STEP = 0.3
 """Step of the differences, in typical sizes: finite, because the tangent at a wheel about to slide or to

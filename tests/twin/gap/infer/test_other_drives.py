@@ -42,7 +42,7 @@ def scores(rng: np.random.Generator, count: int, drive: str, robot: np.ndarray) 
     J, out = DRIVES[drive], []
     for _ in range(count):
         error = rng.standard_normal(ROWS) + J @ (robot + SCATTER * rng.standard_normal(P))
-        out.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+        out.append(Score(J.T @ error, J.T @ J))
     return out
 
 
@@ -85,7 +85,7 @@ def test_the_prior_of_an_offset_is_learned_of_effects_together_and_of_each_chann
     references = []
     for _ in range(6):
         error = rng.standard_normal(ROWS) + J @ sizes
-        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+        references.append(Score(J.T @ error, J.T @ J))
     offsets = learn_offsets(references, effects)
     own, begin = offsets.mean**2 + np.diag(offsets.covariance), 0
     for size in (effects, *[len(BASIS)] * channels):
@@ -106,7 +106,7 @@ def test_what_references_do_not_show_counts_as_unknown() -> None:
     references = []
     for _ in range(12):
         error = rng.standard_normal(ROWS) + J @ (SCATTER * rng.standard_normal(P))
-        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+        references.append(Score(J.T @ error, J.T @ J))
     offsets = learn_offsets(references, len(CANDIDATES.keys))
     assert offsets.covariance[hidden, hidden] == pytest.approx(1.0)
     robot[hidden] = 1.0
@@ -130,11 +130,11 @@ def _where_laws_differ(seed: int, known: bool) -> float:
         for _ in range(count):
             run = robot + SCATTER * rng.standard_normal(P)
             error = rng.standard_normal(ROWS) + J @ np.append(run, there[drive])
-            out.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+            out.append(Score(J.T @ error, J.T @ J))
         return out
 
     def plain(runs: list[Score]) -> list[Score]:
-        return [Score(r.b[:P], r.A[:P, :P], r.square, r.samples) for r in runs]
+        return [Score(r.b[:P], r.A[:P, :P]) for r in runs]
 
     references, runs = some(12, "reference"), some(1, "other")
     offsets = learn_offsets(plain(references), len(CANDIDATES.keys))
@@ -157,7 +157,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
 
 def test_references_that_show_nothing_teach_no_scatter_of_the_misfit() -> None:
     offsets = learn_offsets(trial(1, "reference")[0], len(CANDIDATES.keys))
-    blind = [Score(np.zeros(P + 2), np.zeros((P + 2, P + 2)), 0.0, ROWS)] * 5
+    blind = [Score(np.zeros(P + 2), np.zeros((P + 2, P + 2)))] * 5
     found = learn_misfit(blind, offsets, 0.5, _of_misfit(0.25))
     np.testing.assert_allclose(found.scatter, np.append(offsets.scatter, [MISFIT_SCATTER**2] * 2))
     own = np.diag(found.covariance)
@@ -238,7 +238,7 @@ def test_references_show_how_alike_runs_are(scale: float) -> None:
     references = []
     for _ in range(12):
         error = rng.standard_normal(ROWS) + J @ (robot + scale * SCATTER * rng.standard_normal(P))
-        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+        references.append(Score(J.T @ error, J.T @ J))
     found = np.sqrt(learn_offsets(references, len(CANDIDATES.keys)).scatter) / SCATTER
     assert np.median(found) == pytest.approx(scale, rel=0.25)
 

@@ -10,6 +10,7 @@ import pytest
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
+from terrafusion.twin.gap.rollout import run_soil
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, clip_outliers, initial_state_sigma
 from terrafusion.twin.gap.rollout.run_soil import soil_limit
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -33,6 +34,20 @@ def test_a_run_looks_for_its_ground_where_the_references_are(evidence: GapEviden
     near = [dataclasses.replace(evidence.residuals[0], soil=np.zeros(3))] * 9
     assert soil_limit(wide, evidence.candidates)[0] == 4.0
     assert soil_limit(near, evidence.candidates)[0] < 0.6
+
+
+def test_a_search_that_steps_too_far_tries_a_shorter_step_and_is_the_same_for_judged_runs_and_references(
+    evidence: GapEvidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slip grows steeply as the ground gets weaker: a run whose full step went too far stayed on the
+    references' ground, and one with a limit, which shortens the step, did not."""
+    step = run_soil._soil_step
+    monkeypatch.setattr(run_soil, "_soil_step", lambda *given: 8.0 * step(*given))
+    found = gather_evidence(
+        runs(990, 1), runs(990, 3), load_vehicle("elevate"), None, evidence.candidates, jobs=2
+    )
+    assert all(run.soil.any() for run in found.reference_residuals[:2])
+    np.testing.assert_array_equal(found.residuals[0].soil, found.reference_residuals[0].soil)
 
 
 def test_a_ground_beyond_its_range_is_neither_driven_nor_carried_back(evidence: GapEvidence) -> None:
