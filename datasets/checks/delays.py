@@ -46,7 +46,7 @@ FOLLOWS_AFTER = (0.7, 1.0, 1.4, 2.0)
 
 def check_clocks(context: CheckContext) -> Iterator[Finding]:
     """Clocks compared with each other. A jump hides a drift, either hides an offset: the first counts."""
-    pairs = signal_pairs(CheckContext(without_stuck(context.recording), context.rig))
+    pairs = signal_pairs(CheckContext(without_stuck(context), context.rig))
     jumps = clock_jumps(context.recording, pairs)
     yield from gap_findings(context, {name: [jump.row for jump in found] for name, found in jumps.items()})
     if jumps:
@@ -56,7 +56,7 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     else:
         corrected = _on_one_clock(context)
         if corrected is not context:
-            pairs = signal_pairs(CheckContext(without_stuck(corrected.recording), context.rig))
+            pairs = signal_pairs(CheckContext(without_stuck(corrected), context.rig))
         lags, dragged = sensor_lags(pairs)
         off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
         if off:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
 Repair = Callable[[Recording], Recording]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,14 @@ class CheckContext:
 
     recording: Recording
     rig: Rig | None
+    _found: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
+
+    def once(self, of: "Callable[[CheckContext], T]") -> T:
+        """`of` this context, which several checks need and which is computed once."""
+        if of not in self._found:
+            self._found[of] = of(self)
+        found: T = self._found[of]
+        return found
 
     def wheel_radius_m(self) -> float | None:
         """Wheel radius of the log, else of the rig; 1 where wheel speeds are in m/s."""

@@ -128,7 +128,7 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
 
 def check_bias(context: CheckContext) -> Iterator[Finding]:
     """The gyro must read next to nothing while the wheels stand, and never roll the robot over."""
-    imu, resting = without_stuck(context.recording).imu, at_rest(context)
+    imu, resting = without_stuck(context).imu, at_rest(context)
     if imu is None:
         return
     if resting.sum() >= LEAST_REST_ROWS:

@@ -6,7 +6,7 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, counted, without_rows
 from terrafusion.datasets.checks.motion import ANY_RADIUS_M
-from terrafusion.datasets.checks.signals import SensorAxes, sensors_of, stuck_cells, without_cells
+from terrafusion.datasets.checks.signals import SensorAxes, sensors_of, stuck_sensors, without_cells
 from terrafusion.datasets.core.arrays import Array, Mask
 
 CLIPPED_SHARE, CLIPPED_ROWS, PILE = 0.002, 10, 5.0
@@ -24,7 +24,7 @@ wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 def check_saturated(context: CheckContext) -> Iterator[Finding]:
     """Inertial sensors must not reach the end of their range."""
-    masks = [(s, _clipped(s)) for s in sensors_of(context.recording) if s.channel == "imu"]
+    masks = [(s, _clipped(s, stuck)) for s, stuck in context.once(stuck_sensors) if s.channel == "imu"]
     found = [(sensor, mask) for sensor, mask in masks if mask.any()]
     if not found:
         return
@@ -42,10 +42,9 @@ def check_saturated(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _clipped(sensor: SensorAxes) -> Mask:
+def _clipped(sensor: SensorAxes, stuck: Mask) -> Mask:
     """Mask (N, 3) of the cells at the extreme of an axis where many are exactly there."""
     mask = np.zeros(sensor.values.shape, dtype=bool)
-    stuck = stuck_cells(sensor)
     for k in sensor.known():
         values = np.where(stuck[:, k], np.nan, sensor.values[:, k])
         if not np.isfinite(values).any():

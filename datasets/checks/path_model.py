@@ -79,8 +79,9 @@ class _Windows:
             factor = np.vdot(p, g) / power if power > 0.0 else 0j
             if abs(factor) < 0.2 or abs(factor) > 5.0:
                 continue
+            # These are orthogonal, as the positions are about their mean.
             free = _real(np.stack([np.ones_like(p), 1j * np.ones_like(p), p, 1j * p], axis=1))
-            Q = np.linalg.qr(free / np.maximum(np.linalg.norm(free, axis=0), 1e-12))[0]
+            Q = free / np.linalg.norm(free, axis=0)
             common = _real(np.stack([K[rows], -V[rows], E[rows], 1j * E[rows], B[rows]], axis=1))
             residual = _real(((g / factor) - p)[:, None])[:, 0]
             yield common - Q @ (Q.T @ common), residual - Q @ (Q.T @ residual)

@@ -122,8 +122,7 @@ def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
 def check_stuck(context: CheckContext) -> Iterator[Finding]:
     """Axes that keep one value while the others of their sensor move."""
     stuck: dict[str, list[tuple[SensorAxes, Mask]]] = {}
-    for sensor in sensors_of(context.recording):
-        mask = stuck_cells(sensor)
+    for sensor, mask in context.once(stuck_sensors):
         if mask.any():
             stuck.setdefault(sensor.channel, []).append((sensor, mask))
     for channel, found in stuck.items():
@@ -144,10 +143,15 @@ def check_stuck(context: CheckContext) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def without_stuck(recording: Recording) -> Recording:
+def stuck_sensors(context: CheckContext) -> list[tuple[SensorAxes, Mask]]:
+    """The sensors, each with the mask of `stuck_cells`."""
+    return [(sensor, stuck_cells(sensor)) for sensor in sensors_of(context.recording)]
+
+
+def without_stuck(context: CheckContext) -> Recording:
     """The recording with the cells of stuck axes empty."""
-    for sensor in sensors_of(recording):
-        mask = stuck_cells(sensor)
+    recording = context.recording
+    for sensor, mask in context.once(stuck_sensors):
         if mask.any():
             emptied = {sensor.field: np.where(mask, np.nan, sensor.values)}
             recording = with_fields(recording, sensor.channel, **emptied)

@@ -1,5 +1,6 @@
 """Lag between two signals on different clocks, by cross-correlation, with its interval."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,8 +109,9 @@ def held_rows(values: Array) -> int:
     runs = np.diff(starts)
     if len(runs) < 5:
         return 1
-    typical = np.abs(runs - np.median(runs)) <= max(1.0, 0.25 * float(np.median(runs)))
-    if np.median(runs) < 2.0 or typical.mean() < 0.7:
+    median = float(np.median(runs))
+    typical = np.abs(runs - median) <= max(1.0, 0.25 * median)
+    if median < 2.0 or typical.mean() < 0.7:
         return 1
     return int(runs[typical].max())
 
@@ -230,12 +232,16 @@ def _spread(lags: NDArray[np.int64], parts: Array) -> float | None:
     from scipy.special import stdtrit
 
     blocks = parts.shape[1]
-    rng = np.random.default_rng(SEED)
-    weights = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), RESAMPLES)
-    r = _correlation(np.tensordot(parts, weights, axes=(1, 1)).swapaxes(1, 2))
+    r = _correlation(np.tensordot(parts, _resampled_blocks(blocks), axes=(1, 1)).swapaxes(1, 2))
     vertex = _vertex(lags, r)
     found = np.isfinite(vertex)
     if found.mean() < 0.95:
         return None
     low, high = percentile_interval(vertex[found])
     return float(0.5 * (high - low) * stdtrit(blocks - 1, 0.975) / 1.96)
+
+
+@functools.cache
+def _resampled_blocks(blocks: int) -> NDArray[np.int64]:
+    """How often each block is drawn, (RESAMPLES, blocks)."""
+    return np.random.default_rng(SEED).multinomial(blocks, np.full(blocks, 1.0 / blocks), RESAMPLES)

@@ -142,8 +142,9 @@ class Sheet:
         from bokeh.document import Document
 
         document = Document()
-        for panel in self.panels.values():
-            document.add_root(panel.figure)
+        with document.models.freeze():  # or each figure would have all models counted anew
+            for panel in self.panels.values():
+                document.add_root(panel.figure)
         roots = {panel.figure.id: f"plot-{key}" for key, panel in self.panels.items()}
         docs = {"page": document.to_json(deferred=False)}
         render = [{"docid": "page", "roots": roots, "root_ids": list(roots)}]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import run_checks
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -153,3 +154,15 @@ def test_a_signalling_nan_warns_no_more_than_another(drive: Recording) -> None:
     speed = np.where(np.isnan(speed), np.nan, speed)
     quiet = dataclasses.replace(drive, wheels=dataclasses.replace(drive.wheels, speed=speed))
     assert [f.code for f in run_checks(broken)] == [f.code for f in run_checks(quiet)]
+
+
+def test_what_several_checks_need_is_computed_once(drive: Recording) -> None:
+    computed: list[CheckContext] = []
+
+    def count(context: CheckContext) -> int:
+        computed.append(context)
+        return len(computed)
+
+    context = CheckContext(drive, None)
+    assert [context.once(count), context.once(count)] == [1, 1]
+    assert dataclasses.replace(context, recording=drive).once(count) == 2
