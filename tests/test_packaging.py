@@ -80,6 +80,12 @@ def test_help_does_not_import_the_heavy_packages() -> None:
     assert out == "[]\n"
 
 
+def test_a_replay_begins_without_the_slow_half_of_scipy() -> None:
+    code = "import sys, terrafusion.fusion.replay; print({'scipy.stats', 'scipy.signal'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out == "set()\n"
+
+
 def test_the_version_is_told() -> None:
     done = subprocess.run(
         [sys.executable, "-c", "from terrafusion.fusion.cli.main import main; main()", "--version"],

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.skid import SkidDetector
@@ -25,9 +25,10 @@ from terrafusion.fusion.noise.policy import SensorNoise
 
 WINDOW_S = 5.0
 """Over which a move is judged: a skid lasts a second or two, the smoothing window is as long (assumed)."""
-LIMIT = float(chi2.ppf(0.95, 2))
-"""Of the normalised square. The covariance taken is an upper bound: beside wheels that lose .1 m/sqrt(s) a
-receiver passes it in one of ten drives of two minutes. The wheels then count less for some seconds."""
+LIMIT = 2.0 * float(gammaincinv(1.0, 0.95))
+"""Of the normalised square: 95 % of chi-square with two degrees of freedom. The covariance taken is an upper
+bound: beside wheels that lose .1 m/sqrt(s) a receiver passes it in one of ten drives of two minutes. The
+wheels then count less for some seconds."""
 MOST_YAW_RAD = 0.15
 """Sigma of the heading beyond which it, not the wheels, may have led astray (assumed)."""
 LEAST_SHARE = 0.5

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom
 
 from terrafusion.datasets.checks import CheckContext
 from terrafusion.datasets.checks.path import scales
@@ -204,6 +203,8 @@ def _worse_in_outages(run: Run) -> Iterator[Reason]:
     ]
     if len(ends) < LEAST_OUTAGES:
         return
+    from scipy.stats import binom
+
     ours, theirs = np.array(ends).T
     # One-sided sign test: of n outages, k or more lost by chance.
     lost = int((ours > theirs).sum())
