@@ -17,6 +17,8 @@ from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reducti
 
 STEP_S = 4.0
 """Time between the begins of steps while the robot drives."""
+FAR_MISFIT, BETTER = 4.0, 0.9
+"""From this misfit on, if a step has brought it below this share of what it was, the next begins at once."""
 FEWEST_NODES, MOST_NODES = 4, 60
 """Nodes before the first step, and those of a stretch: the numbers of a full one are the next one's prior."""
 FORGOTTEN = 1.1
@@ -61,6 +63,7 @@ class SelfCalibration:
         self._state: Array | None = None
         self._work: Reduction | None = None
         self._reduced = False
+        self._far, self._step_misfit = False, np.inf
 
     def restart(self, known: Knowledge | None = None) -> None:
         """Begin a new stretch, as the path was interrupted; from `known` if what came since is wrong."""
@@ -123,7 +126,8 @@ class SelfCalibration:
 
     def _due(self) -> bool:
         fixes = len(self._drive.fix) + len(self._fixes)
-        if min(len(self._first), fixes) < FEWEST_NODES or self._now_s - self._stepped_s < STEP_S:
+        wait_s = 0.0 if self._far else STEP_S
+        if min(len(self._first), fixes) < FEWEST_NODES or self._now_s - self._stepped_s < wait_s:
             return False
         standing = self._rolled_m == 0.0 and self._state is not None
         return not (standing and self._state is not None and len(self._state) == len(self._first))
@@ -137,6 +141,8 @@ class SelfCalibration:
             self._begin()
             return False
         self._state, self.known, self.misfit = work.part.state, found, work.misfit
+        self._far = FAR_MISFIT < work.misfit < BETTER * self._step_misfit
+        self._step_misfit = work.misfit
         if len(self._state) >= MOST_NODES:
             wider = dataclasses.replace(found, covariance=found.covariance * FORGOTTEN)
             limit = np.minimum(np.diag(wider.covariance), np.diag(self.prior.covariance))

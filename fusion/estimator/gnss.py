@@ -136,7 +136,8 @@ class GnssUpdater:
         late_ns = round(delay_s * 1e9)
         self.antenna_places = self.antenna_places.then(t_ns, tuple(self.antenna_m.tolist()), late_ns)
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
-        self.delay_s = delay_s
+        earlier_ns, self.delay_s = late_ns - round(self.delay_s * 1e9), delay_s
+        self.waiting = [dataclasses.replace(fix, t_ns=fix.t_ns - earlier_ns) for fix in self.waiting]
 
     def refuse_waiting(self, fitting: list[GnssFix]) -> None:
         """Drop waiting fixes that do not fit those that have given the start."""

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
 
@@ -27,3 +31,15 @@ def test_fixes_late_by_seconds_are_corrected_though_they_look_like_a_slide(late:
     assert any("slid beside its wheels" in note for note in found.estimate.notes)
     assert delay.corrects
     assert abs(delay.value - LATE_S) < 2.0 * delay.sigma
+
+
+def test_fixes_that_wait_are_corrected_with_those_to_come() -> None:
+    """Else they move the place, in doubt since the correction, to where the robot was before."""
+    gnss = Estimator.for_vehicle("husky").gnss
+    fix = GnssFix(10**10, np.zeros(3), np.ones(3), Fix.SINGLE)
+    gnss.queue(fix)
+    gnss.correct(10**10, np.zeros(2), LATE_S)
+    gnss.queue(fix)
+    assert [waiting.t_ns for waiting in gnss.waiting] == [10**10 - int(LATE_S * 1e9)] * 2
+    gnss.correct(10**10, np.zeros(2), 1.0)
+    assert [waiting.t_ns for waiting in gnss.waiting] == [9 * 10**9] * 2
