@@ -7,7 +7,13 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.training.softmax import SoftmaxModel
-from terrafusion.fusion.training.surface_features import HOP_S, WINDOW_S, Signals, surface_windows
+from terrafusion.fusion.training.surface_features import (
+    HOP_S,
+    WINDOW_S,
+    Signals,
+    SurfaceWindows,
+    surface_windows,
+)
 
 PATCHES = 30
 PATCH_S = (10.0, 30.0)
@@ -73,10 +79,9 @@ def _joined(parts: Sequence[tuple[float, Signals]]) -> Signals:
 
 
 def delays(
-    model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
+    model: SoftmaxModel, windows: SurfaceWindows, begins: Sequence[tuple[float, str]]
 ) -> tuple[list[float], float]:
     """Delay of each change, s (inf: missed), and the share of correctly classified windows."""
-    windows = surface_windows(route)
     ends = windows.end_s
     winner = np.array(model.classes)[model.filtered(windows).argmax(axis=1)]
     found: list[float] = []
@@ -92,10 +97,9 @@ def delays(
 
 
 def alarms(
-    model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
+    model: SoftmaxModel, windows: SurfaceWindows, begins: Sequence[tuple[float, str]]
 ) -> tuple[list[bool], int, float]:
     """Whether each change raises an alarm in time; the number of other alarms, and their minutes."""
-    windows = surface_windows(route)
     raised, ends = model.changes(windows), windows.end_s
     elsewhere = np.ones(len(ends), dtype=bool)
     in_time = []
@@ -121,11 +125,12 @@ def changes_seen(
         if len({label for _, label in runs}) < 2:
             continue
         for seed in (first_seed + 2 * fold, first_seed + 2 * fold + 1):
-            route = spliced(runs, seed)
-            here, share = delays(model, *route)
+            route, begins = spliced(runs, seed)
+            windows = surface_windows(route)
+            here, share = delays(model, windows, begins)
             found += here
             right.append(share)
-            in_time, others, spent = alarms(model, *route)
+            in_time, others, spent = alarms(model, windows, begins)
             raised += in_time
             false += others
             minutes += spent

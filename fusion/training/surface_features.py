@@ -170,14 +170,15 @@ def _vibration(window: Signals, rate_hz: float) -> dict[str, float]:
     density = 2.0 * np.abs(np.fft.rfft(signals * taper[:, None], axis=0)) ** 2 / (rate_hz * (taper @ taper))
     frequency = np.arange(len(density)) * rate_hz / n
     values: dict[str, float] = {}
-    for low, high in BANDS_HZ:
+    for i, (low, high) in enumerate(BANDS_HZ):
         if rate_hz < 2.1 * high:
             continue
-        rows = (frequency >= low) & (frequency < high)
-        power = density[rows].mean(axis=0) * (high - low)
+        first, end = np.searchsorted(frequency, (low, high))
+        power = density[first:end].mean(axis=0) * (high - low)
         power[power == 0.0] = np.nan  # a missing channel, filled in with a constant
         levels = 0.5 * np.log10(power + _POWER_FLOOR)
-        values |= {f"{axis}_{low:g}_hz": float(level) for axis, level in zip(AXES, levels, strict=True)}
+        names = VIBRATION[i * len(AXES) : (i + 1) * len(AXES)]
+        values |= dict(zip(names, levels.tolist(), strict=True))
     spread = signals.std(axis=0)
     if (spread[[3, 5]] > 1e-6).all():  # false for NaN, too
         x, z = signals[:, 3] / spread[3], signals[:, 5] / spread[5]

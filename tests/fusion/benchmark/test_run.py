@@ -237,7 +237,8 @@ def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
         run_benchmark(BenchmarkPlan({"field": None}), tmp_path)
 
 
-def test_the_command(terrafusion, one_job, tmp_path) -> None:
+def test_the_command(terrafusion, found, one_job, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(run, "run_job", lambda job: (job, found[1]))
     done = terrafusion("benchmark", "--out", tmp_path / "out", "--only", "outages", "--jobs", 1)
     assert done.status == 0, done.err
     assert "## Errors" in done.out
