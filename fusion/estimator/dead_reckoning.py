@@ -203,7 +203,7 @@ class DeadReckoning:
         at = z + self.lever * complex(math.cos(yaw), math.sin(yaw))
         reach_m = self._reach_m[i - 1] + share * (self._reach_m[i] - self._reach_m[i - 1])
         there = complex(fix.enu_m[0], fix.enu_m[1])
-        return FixPair(fix.t_ns, at, there, float(np.max(fix.sigma_m[:2])), reach_m)
+        return FixPair(fix.t_ns, at, there, fix.horizontal_sigma_m, reach_m)
 
     def scatter(self) -> float:
         """Scatter of the last fixes about the path over their reported sigma; NaN with too few.

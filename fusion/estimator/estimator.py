@@ -120,7 +120,7 @@ class Estimator:
         self._search = StartSearch(config, self.aids, self.gnss)
         self._set_step(config.keyframe_s)
         self._state: State | None = None
-        self._fresh: State | None = None
+        self._fresh: tuple[State, float, float | None, Array, Array] | None = None  # and the motion to it
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
@@ -342,11 +342,9 @@ class Estimator:
             self.chain.add(k, level_factor(k), "X")
         self._zero_velocity(k, t_ns, before, link)
         rolled_m = rolled.distance_m if rolled else None
-        self._finish_keyframe(t_ns, gyro, rolled_m)
-        if self.learned.keyframe(self.chain, dt, None if gap else rolled_m, gyro, accel):
-            self._covariance = self.chain.covariance()
+        self._fresh = self._finish_keyframe(t_ns, gyro, rolled_m), dt, None if gap else rolled_m, gyro, accel
 
-    def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
+    def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> State:
         chain, before = self.chain, self._solve()
         self._frame.step(chain)
         if self.gnss.update(chain, before, self.weights.noise):
@@ -354,11 +352,8 @@ class Estimator:
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
             self._solve()
         chain.forget(self._keep)
-        self.imu.forget(t_ns - KEPT_NS)
-        self.wheels.forget(t_ns - KEPT_NS)
-        self.steering.forget(t_ns - KEPT_NS)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
-        self._fresh = self._emitted(t_ns, gyro)
+        return self._emitted(t_ns, gyro)
 
     def _solve(self) -> Array:
         self.chain.solve(SMOOTH_WINDOW)
@@ -367,9 +362,14 @@ class Estimator:
 
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
-        state, self._fresh = self._fresh, None
-        if state is None:
+        fresh, self._fresh = self._fresh, None
+        if fresh is None:
             return
+        state, *motion = fresh
+        if self.learned.keyframe(self.chain, *motion):
+            self._covariance = self.chain.covariance()
+        for stream in (self.imu, self.wheels, self.steering):
+            stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)
         if turned:
             self.learned.heading_turned()

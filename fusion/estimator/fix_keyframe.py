@@ -73,12 +73,13 @@ def cut_past(
     A fix after a long outage can turn the heading by more than the window's linearisation bears;
     applied to its keyframe alone it is a Kalman update, which cannot diverge.
     """
-    gain = covariance @ jacobian.T @ np.linalg.inv(S)
     doubt = np.zeros(chain.dim)
     if verdict is GateDecision.REACQUIRE:
         doubt[3:6] = float(innovation_m @ innovation_m)
-    elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
-        return False
+    else:
+        turn = covariance[:3] @ (jacobian.T @ np.linalg.solve(S, innovation_m))
+        if max(map(abs, turn.tolist())) < LARGE_TURN_RAD:
+            return False
     chain.restart(doubt, k)
     return True
 

@@ -123,7 +123,7 @@ class GnssUpdater:
         if self.delay_s:
             fix = dataclasses.replace(fix, t_ns=fix.t_ns - round(self.delay_s * 1e9))
         least_m = self.sheet_sigma_m if self.sheet_sigma_m <= RTK_SHEET_M else KINEMATIC_M
-        if fix.sigma_m[:2].min() < 0.999 * least_m:
+        if min(fix.sigma_m[:2].tolist()) < 0.999 * least_m:
             sigma = np.append(np.maximum(fix.sigma_m[:2], least_m), fix.sigma_m[2])
             fix = dataclasses.replace(fix, sigma_m=sigma)
         self.waiting.append(fix)
@@ -255,7 +255,7 @@ class GnssUpdater:
         chain.smooth(len(chain.nodes))
 
     def _doubt_window(self, chain: Chain, fix: GnssFix) -> None:
-        sigma_m = self.scale * float(np.max(fix.sigma_m[:2]))
+        sigma_m = self.scale * fix.horizontal_sigma_m
         doubt = np.zeros(chain.dim)
         doubt[2] = min(DOUBTFUL_YAW_SIGMA_RAD, sigma_m / max(self.track.extent_m(), 1e-3)) ** 2
         doubt[3:5], doubt[VELOCITY] = sigma_m**2, VELOCITY_SIGMA_MPS**2
@@ -270,7 +270,7 @@ class GnssUpdater:
         if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
             return False
         self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
-        self._class_scale[fix.fix] = max(1.0, float(np.max(fix.sigma_m[:2])) / self.sheet_sigma_m)
+        self._class_scale[fix.fix] = max(1.0, fix.horizontal_sigma_m / self.sheet_sigma_m)
         step = chain.nodes[k - chain.first].markov
         if first or step is None:
             return False
@@ -299,7 +299,7 @@ class GnssUpdater:
         # All that the wrong heading may have bent is in doubt again.
         doubt = np.zeros(chain.dim)
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
-        doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
+        doubt[3:6] = off**2 + (fix.horizontal_sigma_m * self.scale) ** 2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
         doubt[SLIP], doubt[DRIFT] = noise.slip_sigma**2, self.drift_sigma_m**2
         chain.restart(doubt, chain.first)
@@ -318,18 +318,19 @@ class GnssUpdater:
         inflation = noise.gnss_inflation * self.scale
         share = self._share = self._drift_share(fix, inflation)
         # The fix is carried to its keyframe by the speed as it is known now.
-        carried_m = abs(at.offset_s) * math.sqrt(
-            0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2]))
-        )
+        east, north = VELOCITY.start, VELOCITY.start + 1
+        carried_m = abs(at.offset_s) * math.sqrt(0.5 * (covariance[east, east] + covariance[north, north]))
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps, delay_s=at.delay_s)
         left, H_pose, H_linear = linearised(position, state)
         innovation, J = -left, np.zeros((3, chain.dim))
         J[:, POSE], J[:, NAV.stop :] = H_pose, H_linear[:, : chain.dim - NAV.stop]
         P = J @ covariance @ J.T
-        predicted_m2 = P[[0, 1], [0, 1]].copy()
+        horizontal = np.einsum("ii->i", P[:2, :2])  # a view
+        predicted_m2 = horizontal.copy()
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
-        P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
+        own_m2 = np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
+        horizontal += own_m2
         verdict, nis = self._gated(chain, k, innovation[:2], P[:2, :2])
         slid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
         if slid and not again and self._test_wheels(chain, k, fix, noise):
@@ -358,12 +359,11 @@ class GnssUpdater:
             return False
         if self._pair is not None:
             self.plausible.accepted(self._pair, verdict is GateDecision.REACQUIRE)
-        own_m2 = float(np.sum(np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2))
-        self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]], own_m2)
-        P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
+        self.skid.accepted(fix.t_ns, innovation[:2], horizontal.copy(), float(own_m2.sum()))
+        horizontal += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
         cut = cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
-        known = bool(np.isfinite(innovation[2] + sigma[2]))
+        known = math.isfinite(innovation[2] + sigma[2])
         if (
             not known
             or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is GateDecision.REJECT
@@ -371,7 +371,7 @@ class GnssUpdater:
             height = (np.asarray(state.pose.translation()) + at.R @ at.lever_m)[2]
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
-        chain.add_fix(k, dataclasses.replace(position, weight=weight))
+        chain.add_fix(k, position if weight == 1.0 else dataclasses.replace(position, weight=weight))
         self._add_velocity(chain, k, fix, at, covariance, noise)
         if cut:
             chain.smooth(chain.last - k + 1)
@@ -399,7 +399,7 @@ class GnssUpdater:
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
         """The velocity of a fix, where it has one that the robot can have."""
-        if fix.velocity_mps is None or not np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
+        if fix.velocity_mps is None or not math.isfinite(sum(fix.velocity_mps.tolist()) + fix.sigma_v_mps):
             return None
         sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
         off_mps = float(np.linalg.norm(fix.velocity_mps - predicted_mps))
@@ -410,7 +410,7 @@ class GnssUpdater:
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""
         refused = [off for off, _ in self.gate.rejected]
-        sigma_m = float(np.max(fix.sigma_m[:2]))
+        sigma_m = fix.horizontal_sigma_m
         if not self.track.smooth_at(fix.t_ns):
             return False
         if not self.skid.test_wheels(chain, k, self.last_used_ns, refused, sigma_m, noise):
@@ -420,14 +420,14 @@ class GnssUpdater:
 
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
-        reported_m = float(np.max(fix.sigma_m[:2])) * inflation
+        reported_m = fix.horizontal_sigma_m * inflation
         slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = self._class_scale.get(fix.fix, 1.0)
         return slow * min(scale, OPTIMISM * reported_m / self.sheet_sigma_m)
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
         """1 sigma (3,) of the white part of a fix."""
-        reported = fix.sigma_m * inflation
-        drift_m = share * self.drift_sigma_m
-        level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, self.white * reported[:2] ** 2))
-        return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
+        *level, up = (fix.sigma_m * inflation).tolist()
+        drift_m2 = (share * self.drift_sigma_m) ** 2
+        white = [math.sqrt(max(sigma**2 - drift_m2, self.white * sigma**2)) for sigma in level]
+        return np.maximum([*white, up * self._height_factor], LEAST_SIGMA_M)

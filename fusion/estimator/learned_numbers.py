@@ -120,7 +120,7 @@ class LearnedNumbers:
     def fix(self, fix: GnssFix) -> None:
         """A fix as it came."""
         if self.calibration is not None:
-            self.calibration.fix(fix.t_ns, fix.enu_m, float(np.max(fix.sigma_m[:2])))
+            self.calibration.fix(fix.t_ns, fix.enu_m, fix.horizontal_sigma_m)
 
     def keyframe(
         self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array

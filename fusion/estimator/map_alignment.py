@@ -76,7 +76,7 @@ def align_to_map(
     known = bool(np.isfinite(fix.enu_m[2] + fix.sigma_m[2]))
     to_m = np.array([there.real, there.imag, fix.enu_m[2] if known else antenna[2]])
     away_m = abs(track.antenna() - fit.middle)
-    reported_m = float(np.max(fix.sigma_m[:2]))
+    reported_m = fix.horizontal_sigma_m
     doubt = np.zeros(chain.dim)
     doubt[2] = fit.sigma_rad**2
     doubt[3:5] = reported_m**2 + fit.residual_m**2 + (fit.sigma_rad * away_m) ** 2

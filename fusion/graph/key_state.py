@@ -153,8 +153,8 @@ class KeyState:
 def linear_sigma(P: Array) -> Array:
     """1 sigma (15,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
     out = np.full(len(LINEAR), np.nan)
-    estimated = np.diag(P)[NAV.stop :]
-    out[: len(estimated)] = np.sqrt(estimated)
+    estimated = P.diagonal()[NAV.stop :]
+    np.sqrt(estimated, out=out[: len(estimated)])
     return out
 
 

@@ -41,6 +41,11 @@ class GnssFix:
     sigma_v_mps: float = float("nan")
     fix: Fix | None = None
 
+    @property
+    def horizontal_sigma_m(self) -> float:
+        """The larger of its sigmas east and north."""
+        return max(self.sigma_m[:2].tolist())
+
 
 def checked_time(t_ns: Any, channel: str) -> int:
     """A time as an integer of ns.
