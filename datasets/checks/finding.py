@@ -1,6 +1,7 @@
 """Types shared by the log checks, and building blocks of their repairs."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -50,14 +51,8 @@ class CheckContext:
 
     recording: Recording
     rig: Rig | None
-    _found: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
-
-    def once(self, of: "Callable[[CheckContext], T]") -> T:
-        """`of` this context, which several checks need and which is computed once."""
-        if of not in self._found:
-            self._found[of] = of(self)
-        found: T = self._found[of]
-        return found
+    computed: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
+    """Results of the functions that are computed `once`."""
 
     def wheel_radius_m(self) -> float | None:
         """Wheel radius of the log, else of the rig; 1 where wheel speeds are in m/s."""
@@ -76,6 +71,19 @@ class CheckContext:
     def since_start_s(self, t_ns: np.int64 | int) -> float:
         """Seconds from the start of the recording."""
         return (int(t_ns) - self.recording.start_ns) * 1e-9  # Python integers: int64 could overflow
+
+
+def once(of: Callable[[CheckContext], T]) -> Callable[[CheckContext], T]:
+    """A function that several checks call, computed once a context; nobody changes what it gives."""
+
+    @functools.wraps(of)
+    def kept(context: CheckContext) -> T:
+        if of not in context.computed:
+            context.computed[of] = of(context)
+        found: T = context.computed[of]
+        return found
+
+    return kept
 
 
 def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:

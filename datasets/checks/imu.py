@@ -18,6 +18,7 @@ from terrafusion.datasets.checks.finding import (
     Finding,
     Repair,
     changed_field,
+    once,
     scaled,
     with_fields,
 )
@@ -72,6 +73,7 @@ LEAST_ACCEL = 0.02
 """m/s2; a run at more constant speed determines nothing."""
 
 
+@once
 def gravity(context: CheckContext) -> Array | None:
     """Mean specific force (3,), m/s2, where all three axes are known."""
     imu = context.recording.imu
@@ -262,6 +264,7 @@ def _detrended(values: Array | Complex) -> Complex:
     return np.asarray(values - np.convolve(values, kernel, "same") / count)
 
 
+@once
 def heading(context: CheckContext) -> ForceHeading | None:
     """`heading_of` the IMU's x and y, with its gyro z; None where z is not up."""
     imu = context.recording.imu

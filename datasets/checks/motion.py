@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.finding import CheckContext, once
 from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
@@ -171,6 +171,7 @@ def chord_speeds(t_ns: TimesNs, position_m: Array) -> Array:
     return speed
 
 
+@once
 def yaw_angles(context: CheckContext) -> dict[str, Integral]:
     """Angle turned (rad; of the wheels metres, right minus left) by "gyro", "wheels", "truth", "command"."""
     recording = context.recording

@@ -24,7 +24,7 @@ wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 def check_saturated(context: CheckContext) -> Iterator[Finding]:
     """Inertial sensors must not reach the end of their range."""
-    masks = [(s, _clipped(s, stuck)) for s, stuck in context.once(stuck_sensors) if s.channel == "imu"]
+    masks = [(s, _clipped(s, stuck)) for s, stuck in stuck_sensors(context) if s.channel == "imu"]
     found = [(sensor, mask) for sensor, mask in masks if mask.any()]
     if not found:
         return

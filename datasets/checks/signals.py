@@ -12,6 +12,7 @@ from terrafusion.datasets.checks.finding import (
     Finding,
     Repair,
     changed,
+    once,
     with_fields,
     without_rows,
 )
@@ -122,7 +123,7 @@ def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
 def check_stuck(context: CheckContext) -> Iterator[Finding]:
     """Axes that keep one value while the others of their sensor move."""
     stuck: dict[str, list[tuple[SensorAxes, Mask]]] = {}
-    for sensor, mask in context.once(stuck_sensors):
+    for sensor, mask in stuck_sensors(context):
         if mask.any():
             stuck.setdefault(sensor.channel, []).append((sensor, mask))
     for channel, found in stuck.items():
@@ -143,6 +144,7 @@ def check_stuck(context: CheckContext) -> Iterator[Finding]:
         )  # fmt: skip
 
 
+@once
 def stuck_sensors(context: CheckContext) -> list[tuple[SensorAxes, Mask]]:
     """The sensors, each with the mask of `stuck_cells`."""
     return [(sensor, stuck_cells(sensor)) for sensor in sensors_of(context.recording)]
@@ -151,7 +153,7 @@ def stuck_sensors(context: CheckContext) -> list[tuple[SensorAxes, Mask]]:
 def without_stuck(context: CheckContext) -> Recording:
     """The recording with the cells of stuck axes empty."""
     recording = context.recording
-    for sensor, mask in context.once(stuck_sensors):
+    for sensor, mask in stuck_sensors(context):
         if mask.any():
             emptied = {sensor.field: np.where(mask, np.nan, sensor.values)}
             recording = with_fields(recording, sensor.channel, **emptied)

@@ -9,7 +9,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, once, scaled, with_fields
 from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.imu import heading, is_upright
 from terrafusion.datasets.checks.motion import (
@@ -127,6 +127,7 @@ def check_unrelated(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
+@once
 def _agreements(context: CheckContext) -> Agreements:
     """What can be compared, without wheels of which one side has the wrong sign: they show no turn."""
     found = agreements(context)
@@ -135,6 +136,7 @@ def _agreements(context: CheckContext) -> Agreements:
     return found
 
 
+@once
 def agreements(context: CheckContext) -> Agreements:
     """Agreement of every pair of yaw sources that can be compared, in the order of `SUSPECTS`."""
     known = yaw_angles(context)

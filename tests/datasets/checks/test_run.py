@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import run_checks
-from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.finding import CheckContext, once
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -156,13 +156,14 @@ def test_a_signalling_nan_warns_no_more_than_another(drive: Recording) -> None:
     assert [f.code for f in run_checks(broken)] == [f.code for f in run_checks(quiet)]
 
 
-def test_what_several_checks_need_is_computed_once(drive: Recording) -> None:
+def test_what_several_checks_need_is_computed_once_a_context(drive: Recording) -> None:
     computed: list[CheckContext] = []
 
+    @once
     def count(context: CheckContext) -> int:
         computed.append(context)
         return len(computed)
 
     context = CheckContext(drive, None)
-    assert [context.once(count), context.once(count)] == [1, 1]
-    assert dataclasses.replace(context, recording=drive).once(count) == 2
+    assert [count(context), count(context)] == [1, 1]
+    assert count(dataclasses.replace(context, recording=drive)) == 2
