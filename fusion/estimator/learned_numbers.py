@@ -240,12 +240,16 @@ class LearnedNumbers:
             self._forget(self.calibration.before)
 
     def with_doubt(self, noise: SensorNoise, t_ns: int, segments: list[ImuSegment]) -> SensorNoise:
-        """Noise of the yaw rate, up to a keyframe at `t_ns`, with the uncertainty of its scale."""
+        """Noise of the yaw rate, up to a keyframe at `t_ns`, with the doubt of its scale: its sigma, and what
+        the scale seems wrong by but not clearly enough to be corrected.
+        """
         if self.calibration is None:
             return noise
         last_ns = self._gnss.last_used_ns
         unaided_s = math.inf if last_ns is None else max(t_ns - last_ns, 0) * 1e-9
-        return with_turn_doubt(noise, self._known, segments, self._spec, unaided_s)
+        off = float(self._known.mean[TURN_SCALE]) - self._imu.turn_scale
+        doubt = math.hypot(float(self._known.sigma[TURN_SCALE]), off)
+        return with_turn_doubt(noise, doubt, segments, self._spec, unaided_s)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
         turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()
@@ -306,9 +310,9 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
 
 
 def with_turn_doubt(
-    noise: SensorNoise, known: Knowledge, segments: list[ImuSegment], imu: ImuSpec, unaided_s: float
+    noise: SensorNoise, doubt: float, segments: list[ImuSegment], imu: ImuSpec, unaided_s: float
 ) -> SensorNoise:
-    """Noise of a keyframe's yaw rate with the uncertainty of its scale, `unaided_s` after the last fix.
+    """Noise of a keyframe's yaw rate with the `doubt` of its scale, 1 sigma, `unaided_s` after the last fix.
 
     In a steady turn at rate w an error s of the scale turns the heading by s w t; white noise of density
     sqrt(2 t) s w gives the same variance at every t.
@@ -316,7 +320,7 @@ def with_turn_doubt(
     total = sum(s.dt_s for s in segments)
     rate = abs(sum(float(s.gyro_radps[2]) * s.dt_s for s in segments)) / total if total > 0.0 else 0.0
     grown = math.sqrt(min(2.0 * unaided_s, TURN_TIME_S))
-    more = float(known.sigma[TURN_SCALE]) * rate * grown / imu.gyro_noise_radps_sqrthz
+    more = doubt * rate * grown / imu.gyro_noise_radps_sqrthz
     if more < 0.1 * noise.gyro_yaw_inflation:
         return noise
     return dataclasses.replace(noise, gyro_yaw_inflation=math.hypot(noise.gyro_yaw_inflation, more))

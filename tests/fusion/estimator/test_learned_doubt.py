@@ -39,16 +39,10 @@ def noise() -> SensorNoise:
     return dataclasses.replace(load_policy().fixed, gyro_yaw_inflation=1.0)
 
 
-def known() -> Knowledge:
-    variance = np.zeros(len(NUMBERS))
-    variance[TURN_SCALE] = SCALE_SIGMA**2
-    return Knowledge(np.zeros(len(NUMBERS)), np.diag(variance), 0.05, 300.0)
-
-
 def added_density(unaided_s: float, rate_radps: float = RATE_RADPS) -> float:
     """Density, rad/s/sqrt(Hz), by which the doubt widens the noise of the yaw rate."""
     segment = ImuSegment(STEP_S, np.array([0.0, 0.0, rate_radps]), np.zeros(3), False, False)
-    widened = with_turn_doubt(noise(), known(), [segment], IMU, unaided_s).gyro_yaw_inflation
+    widened = with_turn_doubt(noise(), SCALE_SIGMA, [segment], IMU, unaided_s).gyro_yaw_inflation
     return IMU.gyro_noise_radps_sqrthz * math.sqrt(widened**2 - 1.0)
 
 
@@ -66,6 +60,16 @@ def test_there_is_no_doubt_at_a_fix_or_on_a_straight() -> None:
 
 def test_the_doubt_is_bounded_where_no_fix_was_used() -> None:
     assert added_density(math.inf) == pytest.approx(SCALE_SIGMA * RATE_RADPS * math.sqrt(TURN_TIME_S))
+
+
+def test_a_scale_that_seems_wrong_and_is_not_corrected_is_doubted_by_as_much() -> None:
+    learned = Estimator.for_vehicle("husky", "fixed").learned
+    segments = [ImuSegment(STEP_S, np.array([0.0, 0.0, RATE_RADPS]), np.zeros(3), False, False)]
+    mean, variance = np.zeros(len(NUMBERS)), np.full(len(NUMBERS), 1e-12)
+    mean[TURN_SCALE], variance[TURN_SCALE] = 0.04, 0.03**2
+    learned._known = Knowledge(mean, np.diag(variance), 0.05, 300.0)
+    doubt = with_turn_doubt(noise(), 0.05, segments, IMU, math.inf)
+    assert learned.with_doubt(noise(), 0, segments).gyro_yaw_inflation == doubt.gyro_yaw_inflation
 
 
 @pytest.mark.parametrize(("sigma_s", "corrected_s"), [(0.12, 0.0), (0.09, 0.4)])
