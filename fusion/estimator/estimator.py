@@ -365,8 +365,8 @@ class Estimator:
         fresh, self._fresh = self._fresh, None
         if fresh is None:
             return
-        state, *motion = fresh
-        if self.learned.keyframe(self.chain, *motion):
+        state, dt, rolled_m, gyro, accel = fresh
+        if self.learned.keyframe(self.chain, dt, rolled_m, gyro, accel):
             self._covariance = self.chain.covariance()
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
