@@ -35,6 +35,14 @@ ESTIMATOR = (
         "How long does the estimator compute, live and in batch, beside GTSAM's own optimisers?",
         module("speed.speed"),
         3,
+        {
+            "keyframe_mean_ms": r"  keyframe, CPU : mean ([\d.]+)",
+            "keyframe_p99_ms": r"  keyframe, CPU :.* p99 ([\d.]+)",
+            "states_p99_ms": r"    keyframe, CPU :.* p99 ([\d.]+)",
+            "live_pass_s": r"  batch: live pass [\d.]+ s wall, ([\d.]+)",
+            "batch_s": r"  batch of \d{4} keyframes, ours: ([\d.]+)",
+            "gtsam_batch_s": r"  batch of \d{4} keyframes, GTSAM GaussNewton[^:]*: ([\d.]+)",
+        },
     ),
     Study(
         "slip",

@@ -3,7 +3,8 @@
     python -m tests.studies.speed.speed [LOG ...] [--vehicle NAME] [--profile]
 
 Without logs a drive of the twin is taken. Wall time is what a robot waits for; CPU time of the thread tells
-it from what other programs on the machine took, and is what GTSAM is compared by. All is made in one run.
+it from what other programs on the machine took, and is what GTSAM is compared by. Other programs still empty
+the caches: a keyframe's time is the least of `PASSES` drives, which are the same to the last bit.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from tests.studies.speed.gtsam_graph import Graph
 Array = NDArray[np.float64]
 
 SCENARIO = {"scenario": "paper_profile", "terrain": "medium_sand", "slope_deg": 5.0, "seed": 4}
+PASSES = 3
 SHORT_S = 30.0
 """Length of the drive for GTSAM's slow ones: with Python factors its batch copies all values at each."""
 
@@ -95,6 +97,15 @@ def live(recording: Recording, config: EstimatorConfig, keep: bool = False) -> L
     if not taken.wall_ms:
         raise DataError("the estimator never started", remedy="see `terrafusion inspect`")
     return taken
+
+
+def least(recording: Recording, config: EstimatorConfig) -> Live:
+    """`live` several times, with its factors: of each keyframe, and of the whole, the least times."""
+    passes = [live(recording, config, keep=True) for _ in range(PASSES)]
+    for name in ("wall_ms", "cpu_ms", "upkeep_ms"):
+        setattr(passes[0], name, np.min([getattr(one, name) for one in passes], axis=0).tolist())
+    passes[0].seconds, passes[0].cpu_s = (min(getattr(p, n) for p in passes) for n in ("seconds", "cpu_s"))
+    return passes[0]
 
 
 def timed(call: Callable[[], object]) -> tuple[float, float]:
@@ -216,11 +227,14 @@ def _report(recording: Recording, vehicle: str | None, with_profile: bool) -> No
 
     robot, _ = choose_vehicle(recording, vehicle)
     config = EstimatorConfig(robot.rig(), robot.name)
-    print(f"{recording.duration_s():.0f} s of {robot.name}, lag {config.lag_s:g} s")
-    taken = live(recording, config, keep=True)
+    print(f"{recording.duration_s():.0f} s of {robot.name}, lag {config.lag_s:g} s, least of {PASSES} drives")
+    taken = least(recording, config)
     assert taken.archive is not None
     for line in taken.lines():
         print(f"  {line}", flush=True)
+    print("  with the states of a calibration")
+    for line in least(recording, dataclasses.replace(config, calibrate=True)).lines():
+        print(f"    {line}", flush=True)
     print(f"  batch: live pass {taken.seconds:.2f} s wall, {taken.cpu_s:.2f} s CPU, then")
     for name, (wall, cpu) in batch_parts(taken.archive, initial(taken)).items():
         print(f"    {name}: {wall:.3f} s wall, {cpu:.3f} s CPU", flush=True)
