@@ -112,6 +112,17 @@ TWIN = (
         1,
     ),
     Study(
+        "gap_sites",
+        "Does the diagnosis hold on ground that varies more than the references'?",
+        module("gap_sites", "--out", OUT),
+        3,
+        {
+            "alike": r"false alarms, ground as the references': (\d+ of \d+)",
+            "patchier": r"false alarms, ground patchier: (\d+ of \d+)",
+        },
+        spread=True,
+    ),
+    Study(
         "blind",
         "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
         (
