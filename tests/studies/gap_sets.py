@@ -26,7 +26,14 @@ import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import catalogue, parameters
-from terrafusion.twin.gap.blind.rates import Rate
+from terrafusion.twin.gap.answer.verdict import (
+    FINEST_P,
+    credible_members,
+    credible_sets,
+    most_probable,
+    null_probability,
+)
+from terrafusion.twin.gap.blind.rates import Rate, Reliability, reliability
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.calibration import Head, calibration_head, probabilities
 from terrafusion.twin.gap.infer.detection import detect
@@ -206,7 +213,13 @@ def stored(found: Explanation, candidates: Candidates) -> dict[str, Any]:
 def restored(found: Mapping[str, Any]) -> Explanation:
     """The explanation without its fits."""
     evidence = {tuple(k.split("+")): v for k, v in found["evidence"].items()}
-    return Explanation(evidence, {}, found["outside"], {}, lambda fit: [])
+    alike = {effect: {*some} for effect, some in found["alike"].items()}
+    return Explanation(evidence, {}, found["outside"], alike, lambda fit: [])
+
+
+def p_value(one: Mapping[str, Any]) -> float:
+    """Of the gap in a set, as fine as the verdict takes it."""
+    return max(float(one["p"]), FINEST_P[bool(one["other_drives"])])
 
 
 def questions(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Explanation, float, tuple[str, ...] | None]]:
@@ -216,9 +229,10 @@ def questions(sets: Sequence[Mapping[str, Any]]) -> list[tuple[Explanation, floa
         truth = tuple(sorted({key.split("/")[0] for key in one["truth"]}))
         odd_one = one["number"] in range(ODD, HELD_OUT)
         if one["p"] <= SIGNIFICANCE and (truth or odd_one):
-            out.append((restored(one["known"]), one["p"], None if odd_one else truth))
-            out += [(restored(one["shifted"]), one["p"], truth)] if "shifted" in one else []
-            out += [(restored(one["outside"]), one["p"], None)] if "outside" in one else []
+            p = p_value(one)
+            out.append((restored(one["known"]), p, None if odd_one else truth))
+            out += [(restored(one["shifted"]), p, truth)] if "shifted" in one else []
+            out += [(restored(one["outside"]), p, None)] if "outside" in one else []
     return out
 
 
@@ -270,16 +284,16 @@ def scores(sets: Sequence[Mapping[str, Any]], head: Head) -> dict[str, Rate]:
         if one["number"] in range(ODD, HELD_OUT):
             hits.setdefault("odd seen", []).append(seen)
             if seen:
-                found = probabilities(restored(one["known"]), effects, head, one["p"])
+                found = probabilities(restored(one["known"]), effects, head, p_value(one))
                 hits.setdefault("odd unknown", []).append(found[1] > 0.5)
             continue
         hits.setdefault("seen" if truth else "false alarms", []).append(seen)
         if "shifted" in one:
-            known, unknown = probabilities(restored(one["shifted"]), effects, head, one["p"])
+            known, unknown = probabilities(restored(one["shifted"]), effects, head, p_value(one))
             hits.setdefault("shifted right", []).append(bool(truth & {*max(known, key=lambda s: known[s])}))
             hits.setdefault("shifted falsely unknown", []).append(unknown > 0.5)
         if truth and seen:
-            known, unknown = probabilities(restored(one["known"]), effects, head, one["p"])
+            known, unknown = probabilities(restored(one["known"]), effects, head, p_value(one))
             best = max(known, key=lambda s: known[s])
             hits.setdefault("falsely unknown", []).append(unknown > 0.5)
             name = "one of one right" if len(truth) == 1 else "one of a pair right"
@@ -287,9 +301,24 @@ def scores(sets: Sequence[Mapping[str, Any]], head: Head) -> dict[str, Rate]:
             hits.setdefault("named as many", []).append(len(best) == len(truth))
         if "outside" in one:
             hits.setdefault("unknown", []).append(
-                probabilities(restored(one["outside"]), effects, head, one["p"])[1] > 0.5
+                probabilities(restored(one["outside"]), effects, head, p_value(one))[1] > 0.5
             )
     return {name: Rate(sum(some), len(some)) for name, some in hits.items()}
+
+
+def certainty(sets: Sequence[Mapping[str, Any]], head: Head) -> Reliability:
+    """What is stated of the first class, by the package's rules, beside whether it holds a true effect."""
+    effects, stated, true = len(Candidates.of().effects), list[float](), list[bool]()
+    for found, p, truth in questions(sets):
+        if truth is not None:
+            known, unknown = probabilities(found, effects, head, p)
+            certain = (1.0 - null_probability(p)) * (1.0 - unknown) / sum(known.values())
+            known = {name: certain * q for name, q in known.items()}
+            best = most_probable(known)
+            first = credible_sets({e: credible_members(e, best, known, found.alike) for e in best}, known)[0]
+            stated.append(first.probability)
+            true.append(bool({*first.effects} & {*truth}))
+    return reliability(stated, true)
 
 
 def main() -> None:
@@ -319,6 +348,8 @@ def main() -> None:
     head = calibration_head() if given.command == "score" else train(sets)
     for name, rate in scores(sets, head).items():
         print(f"{name}: {rate.hits} of {rate.count}")
+    found = certainty(sets, head)
+    print(f"stated certainty against outcome: ECE {found.ece:.3f}, Brier {found.brier:.3f} of {found.count}")
     if given.command == "train":
         numbers = "".join(f"{name}: {value:.3g}\n" for name, value in dataclasses.asdict(head).items())
         text = f"# Fitted to {len(sets)} sets by\n# python -m tests.studies.gap_sets train\n{numbers}"

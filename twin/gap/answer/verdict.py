@@ -111,9 +111,11 @@ def judge(
     unknown = unknown if detected else 0.0
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}
-    best = _best(sets)
-    classes = {effect: _class(effect, best, sets, found.alike) for effect in (best if detected else ())}
-    credible = _credible(classes, sets) if detected else []
+    best = most_probable(sets)
+    classes = {
+        effect: credible_members(effect, best, sets, found.alike) for effect in (best if detected else ())
+    }
+    credible = credible_sets(classes, sets) if detected else []
     causes = _causes(found, sets, best, classes, candidates, head)
     p_unknown = (1.0 - p_null) * unknown
     if not detected:
@@ -128,7 +130,7 @@ def judge(
     return GapVerdict(kind, named, causes, credible, p_null, p_unknown, _fit(found, found.fits[best]), odds)
 
 
-def _best(sets: Mapping[Sets, float]) -> Sets:
+def most_probable(sets: Mapping[Sets, float]) -> Sets:
     """The most probable set of the most probable number of effects."""
     by_count: dict[int, float] = {}
     for name, p in sets.items():
@@ -137,7 +139,7 @@ def _best(sets: Mapping[Sets, float]) -> Sets:
     return max((name for name in sets if len(name) == count), key=lambda name: sets[name])
 
 
-def _class(
+def credible_members(
     effect: str, best: Sets, sets: Mapping[Sets, float], alike: Mapping[str, set[str]]
 ) -> tuple[str, ...]:
     """Effects that could stand in the place of one, the others being as they are; and those whose signatures
@@ -158,7 +160,7 @@ def _class(
     return (*members, *sorted(same, key=lambda name: -instead.get(name, 0.0)))
 
 
-def _credible(classes: Mapping[str, tuple[str, ...]], sets: Mapping[Sets, float]) -> list[CredibleSet]:
+def credible_sets(classes: Mapping[str, tuple[str, ...]], sets: Mapping[Sets, float]) -> list[CredibleSet]:
     """A set for each named effect, then for the most probable others; the most certain first."""
 
     def present(effects: Sequence[str]) -> float:
