@@ -52,15 +52,16 @@ class History:
 
         Where fixes have `aligned` the path with the map, no state of it is local any more.
         """
-        batch = BatchSmoother(archive, [key_state_of(state) for state in self.states])
+        live = [key_state_of(state) for state in self.states]
+        batch = BatchSmoother(archive, live)
         batch.optimise()
         keys, covariances = batch.states(), batch.covariances()
         offset = len(keys) - len(self.states)
         imu, keyframe_s = config.rig.sensors.imu, config.keyframe_s
         self.states = [
-            smoothed(state, key, P, gyro_sigma_radps(imu, keyframe_s, noise))
-            for state, key, P, noise in zip(
-                self.states, keys[offset:], covariances[offset:], self.noises, strict=True
+            smoothed(state, was, key, P, gyro_sigma_radps(imu, keyframe_s, noise))
+            for state, was, key, P, noise in zip(
+                self.states, live, keys[offset:], covariances[offset:], self.noises, strict=True
             )
         ]
         if aligned:

@@ -55,8 +55,8 @@ def state_fields(key: KeyState, P: Array, gyro_radps: Array, gyro_sigma_radps: A
     }
 
 
-def smoothed(live: State, key: KeyState, P: Array, gyro_sigma_radps: Array) -> State:
-    """The live state of a keyframe with the batch solution `key` and its covariance P in its place."""
-    gyro = key_state_of(live).reading(live.angular_velocity_radps)
+def smoothed(live: State, was: KeyState, key: KeyState, P: Array, gyro_sigma_radps: Array) -> State:
+    """The live state of a keyframe (`was` in the graph), by the batch solution `key` and its covariance P."""
+    gyro = was.reading(live.angular_velocity_radps)
     slip = key.slip + (live.slip - float(live.linear[0]))
     return dataclasses.replace(live, slip=slip, **state_fields(key, P, gyro, gyro_sigma_radps))
