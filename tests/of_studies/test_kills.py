@@ -8,7 +8,7 @@ import pytest
 
 from tests.studies.kills.commands import COMMANDS, prepared
 from tests.studies.kills.kills import BAD, killed, reference_run
-from tests.studies.kills.leftovers import half_files
+from tests.studies.kills.leftovers import half_files, whole
 from tests.studies.kills.troubles import TROUBLES, troubled, two_at_once
 
 WORDS = COMMANDS["simulate"]
@@ -52,3 +52,13 @@ def test_half_a_file_is_seen(work: Path, tmp_path: Path) -> None:
         (cut / path.name).write_bytes(path.read_bytes())
     (cut / "imu.csv").write_text("".join(rows[: len(rows) // 2]))
     assert half_files(cut.parent, whole) == ["run: not the whole log"]
+
+
+def test_a_table_with_commas_in_quotes_is_whole_and_a_cut_one_is_not(tmp_path: Path) -> None:
+    table = tmp_path / "a.csv"
+    table.write_text('name,why\n"a, b",c\nd,"e, f"\n')
+    assert whole(table)
+    table.write_text('name,why\n"a, b",c\nd\n')
+    assert not whole(table)
+    table.write_text('name,why\n"a, b",c\nd,e')
+    assert not whole(table)

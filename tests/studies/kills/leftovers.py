@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import gzip
 import json
 from pathlib import Path
@@ -39,10 +40,9 @@ def whole(path: Path) -> bool:
         return False
     tails = {".html": b"</html>", ".png": b"IEND\xaeB`\x82", ".parquet": b"PAR1", ".mcap": b"\x89MCAP0\r\n"}
     if kind == ".csv":
-        rows = data.split(b"\n")
-        return (
-            rows[-1] == b"" and len({row.count(b",") for row in rows[:-1] if not row.startswith(b"#")}) == 1
-        )
+        lines = data.decode(errors="replace").splitlines(keepends=True)
+        rows = csv.reader(line for line in lines if not line.startswith("#"))
+        return data.endswith(b"\n") and len({len(row) for row in rows}) == 1
     return data.rstrip(b"\n" if kind == ".html" else b"").endswith(tails.get(kind, b""))
 
 
