@@ -51,7 +51,7 @@ def gnss_velocity_factor(
             H[0], H[1], H[2] = velocity_factor.jacobians(velocity, pose, linear)
         return velocity_factor.residual(velocity, pose, values.atVector(velocity_key), linear)
 
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, velocity.sigma_mps)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(velocity.sigma_mps)
     return gtsam.CustomFactor(noise, [pose_key, velocity_key, linear_key], error)
 
 

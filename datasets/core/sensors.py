@@ -24,6 +24,8 @@ AXES = {
 
 STEERED_DRIVES = DRIVES[3:]
 
+ASSUMED_VELOCITY_SIGMA_MPS = 0.5
+"""1 sigma of a velocity whose receiver reports none: data sheets promise .05 m/s in the open (assumed)."""
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
 """Sigma of each horizontal axis by class of fix, where neither log nor vehicle gives it; up has twice that.
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""

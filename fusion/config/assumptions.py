@@ -11,7 +11,7 @@ import numpy as np
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.twin.model.vehicle import VehicleParams, vehicle_names
 from terrafusion.twin.model.vehicle_file import read_vehicle
@@ -127,6 +127,9 @@ def _of_the_fixes(recording: Recording, used: Gnss | None) -> Iterator[Assumptio
     for fix in np.unique(gnss.fix[unknown]).tolist():
         sigma = ASSUMED_SIGMA_M[Fix(fix)]
         yield Assumption(f"gnss_sigma_m ({Fix(fix).name.lower()})", sigma, sigma, "m")
+    velocity, sigma_v = gnss.velocity_enu_mps, gnss.sigma_v_mps
+    if velocity is not None and (sigma_v is None or not (sigma_v > 0.0).any()):
+        yield Assumption("gnss_velocity_sigma_mps", ASSUMED_VELOCITY_SIGMA_MPS, None, "m/s")
 
 
 def _of_the_reader(recording: Recording) -> Iterator[Assumption]:

@@ -35,6 +35,8 @@ KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 """Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
+UNKNOWN_CLIMB_MPS = 100.0
+"""1 sigma of the upward velocity of a receiver that reports speed and course alone."""
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
@@ -387,25 +389,27 @@ class GnssUpdater:
         measured_mps = self._usable_velocity(fix, at.velocity_mps, covariance)
         if measured_mps is None:
             return
-        sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
-        at_keyframe = measured_mps - at.accel_mps2 * at.offset_s
+        measured = np.isfinite(measured_mps)
+        sigma = np.where(measured, max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), UNKNOWN_CLIMB_MPS)
+        at_keyframe = np.where(measured, measured_mps, at.velocity_mps) - at.accel_mps2 * at.offset_s
         if chain.dim > GNSS_DELAY:
             doubt = float(np.linalg.norm(at.accel_mps2) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
-            sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(at.rate_radps, at.offset_s)
-            chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
+            sigma, turned = np.hypot(sigma, doubt), lever_arm_velocity(at.rate_radps, at.offset_s)
+            chain.add_velocity(k, GnssVelocity(at_keyframe, sigma, self.antenna_m, turned))
         else:
             lever_mps = at.R @ cross(at.rate_radps, at.antenna_m)
-            chain.add(k, gnss_velocity(k, at_keyframe - lever_mps, sigma_v), "V")
+            chain.add(k, gnss_velocity(k, at_keyframe - lever_mps, sigma), "V")
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
-        """The velocity of a fix, where it has one that the robot can have."""
-        if fix.velocity_mps is None or not math.isfinite(sum(fix.velocity_mps.tolist()) + fix.sigma_v_mps):
+        """The velocity (3,) of a fix, NaN where not measured; None where there is none that a robot has."""
+        velocity = fix.velocity_mps
+        if velocity is None or not math.isfinite(float(velocity[0] + velocity[1]) + fix.sigma_v_mps):
             return None
         sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
-        off_mps = float(np.linalg.norm(fix.velocity_mps - predicted_mps))
+        off_mps = math.sqrt(float(np.nansum((velocity - predicted_mps) ** 2)))
         usable = off_mps <= VELOCITY_OFF_MPS + VELOCITY_OFF_SIGMA * sigma_mps
         self.velocities_refused += not usable
-        return fix.velocity_mps if usable else None
+        return velocity if usable else None
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""

@@ -319,7 +319,7 @@ class _Velocities:
             for name in ("velocity_mps", "lever_m")
         )
         self._swing = np.array([one.lever_rate_radps for one in flat]).reshape(-1, 3, 3)
-        self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 1, 1)
+        self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 3, 1)
 
     def fill(self, rows: Array, values: gtsam.Values, begin: int, R: Array, linear: Array) -> None:
         """Into rows (n, m, 2 dim + 1) of the keyframes from `begin` on."""

@@ -26,13 +26,13 @@ class GnssVelocity:
 
     Attributes:
         velocity_mps: (3,) of the antenna, world.
-        sigma_mps: 1 sigma of each axis, white.
+        sigma_mps: 1 sigma (3,), white; large along an axis that is not measured.
         lever_m: (3,) the antenna's place in the vehicle file, body.
         lever_rate_radps: (3, 3), see `lever_arm_velocity`.
     """
 
     velocity_mps: Array
-    sigma_mps: float
+    sigma_mps: Array
     lever_m: Array
     lever_rate_radps: Array
 
@@ -69,4 +69,4 @@ def rows(velocity: GnssVelocity, point: KeyState, dim: int) -> Array:
     H_pose, H_velocity, H_linear = jacobians(velocity, point.pose, point.linear)
     out[:, POSE], out[:, VELOCITY], out[:, NAV.stop : dim] = H_pose, H_velocity, H_linear[:, : dim - NAV.stop]
     out[:, dim] = -residual(velocity, point.pose, point.velocity, point.linear)
-    return out / velocity.sigma_mps
+    return out / velocity.sigma_mps[:, None]

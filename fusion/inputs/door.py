@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS
 
 MOST_RADPS, MOST_MPS2 = 100.0, 2000.0
 """Beyond these no gyro (35 to 70 rad/s) or accelerometer (some 200 g) of a robot measures."""
@@ -116,7 +116,8 @@ def checked_fix(
 
     A sigma that is missing, NaN, below 1 mm or above 1 km is replaced by that of the class of fix
     (`ASSUMED_SIGMA_M`; up twice as much). Without a class, less than 1 mm is taken for 1 mm, and a fix of
-    more than 1 km is none. A velocity without a positive sigma is left out, a height without one is free.
+    more than 1 km is none. A velocity without a positive sigma has `ASSUMED_VELOCITY_SIGMA_MPS`, one without
+    its upward part tells of the others; a height without a sigma is free.
 
     Raises:
         DataError: no time, no east or north, an unknown class of fix, neither sigma nor class, or a
@@ -149,7 +150,7 @@ def checked_fix(
         velocity = np.clip(velocity, -MOST_TRAVEL_M, MOST_TRAVEL_M)
     sigma_v_mps = as_number(sigma_v_mps, "velocity sigma", "gnss")
     if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
-        velocity = None
+        sigma_v_mps = ASSUMED_VELOCITY_SIGMA_MPS
     return GnssFix(t_ns, position, sigma, velocity, sigma_v_mps, known)
 
 

@@ -44,7 +44,7 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
             chain.add_fix(k, fix)
             if calibrate:
                 turned = lever_arm_velocity(np.array([0.1, -0.2, 0.3 * k]), -0.05)
-                chain.add_velocity(k, GnssVelocity(velocity, 0.1, lever, turned))
+                chain.add_velocity(k, GnssVelocity(velocity, np.array([0.1, 0.2, 9.0]), lever, turned))
     return chain
 
 

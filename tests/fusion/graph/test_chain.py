@@ -100,7 +100,10 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
             chain.add_fix(k, fix)
             graph.add(gtsam_factors.gnss_position_factor(fix, X(k), M(k)))
             told = GnssVelocity(
-                points[k].velocity, 0.1, np.array([0.2, 0.0, 0.3]), lever_arm_velocity(RATE, -0.05)
+                points[k].velocity,
+                np.array([0.1, 0.2, 9.0]),
+                np.array([0.2, 0.0, 0.3]),
+                lever_arm_velocity(RATE, -0.05),
             )
             chain.add_velocity(k, told)
             graph.add(gtsam_factors.gnss_velocity_factor(told, X(k), V(k), M(k)))
@@ -313,7 +316,10 @@ def test_velocity_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose, linear, v = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N), rng.normal(0, 1, 3)
     told = GnssVelocity(
-        rng.normal(0, 1, 3), 0.1, rng.normal(0, 0.5, 3), lever_arm_velocity(rng.normal(0, 1, 3), -0.1)
+        rng.normal(0, 1, 3),
+        np.full(3, 0.1),
+        rng.normal(0, 0.5, 3),
+        lever_arm_velocity(rng.normal(0, 1, 3), -0.1),
     )
     H_pose, H_velocity, H_linear = velocity_factor.jacobians(told, pose, linear)
     for H, function, n in (
