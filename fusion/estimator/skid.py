@@ -102,7 +102,7 @@ class SkidDetector:
         if off_m > sum(rolled_m) + fastest_mps * float(sum(steps_s)) + REACH_SIGMA * sigma_m:
             return False
         more_m2ps = max(0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps, 0.0)
-        if len(refused) > 1 and since_ns >= chain.nodes[0].t_ns:
+        if len(refused) > 1:
             doubt = np.zeros(chain.dim)
             doubt[VELOCITY][:2] = (off_m / max(float(sum(steps_s)), LEAST_GAP_S)) ** 2
             chain.restart(doubt, begin)
