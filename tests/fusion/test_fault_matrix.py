@@ -39,10 +39,14 @@ def test_fixes_a_tenth_of_a_second_late_do_not_pass_as_good() -> None:
     assert tried(Cell(562, "steered", "adaptive", True, ("lag",)))["verdict"] == "doubtful"
 
 
-@pytest.mark.parametrize("number", [155, 603, 757])
+@pytest.mark.parametrize("number", [155, 603])
 def test_what_the_drive_itself_refutes_is_not_good(number: int) -> None:
-    """An IMU whose turn shows late, or never in half a log; an estimate that gave in to fixes."""
-    assert tried(Cell.drawn(number, (*TWIN, *FIELD)))["outcome"] == "warned"
+    """An IMU whose turn shows late, or never in half a log."""
+    assert tried(Cell.drawn(number, (*TWIN, *FIELD)))["verdict"] == "doubtful"
+
+
+def test_fixes_stamped_ahead_do_not_lead_astray() -> None:
+    assert tried(Cell.drawn(757, (*TWIN, *FIELD)))["outcome"] == "ok"
 
 
 def test_a_fault_changes_the_log_alone_that_it_is_given() -> None:
