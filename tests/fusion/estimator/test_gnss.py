@@ -15,8 +15,6 @@ from scipy.stats import chi2
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import ASSUMED_VELOCITY_SIGMA_MPS
-from terrafusion.fusion.api.replays import replay
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
@@ -375,43 +373,6 @@ def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() ->
     track = DeadReckoning(np.zeros(3))
     track.pairs = [FixPair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
     assert track.heading_correction(0.1, 1.0) is None
-
-
-@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_velocity_of_unknown_sigma_has_an_assumed_one(sigma: float) -> None:
-    taken = checked_fix(0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.0], [1.0, 0.0, 0.0], sigma, None)
-    assert taken is not None
-    assert taken.velocity_mps is not None
-    assert taken.sigma_v_mps == ASSUMED_VELOCITY_SIGMA_MPS
-    assert np.isnan(taken.sigma_m[2]), "nor is a height"
-
-
-@pytest.mark.parametrize("calibrate", [False, True])
-def test_a_velocity_without_its_upward_part_tells_as_much_of_the_motion(
-    drive: Recording, calibrate: bool
-) -> None:
-    """Receivers that report speed and course; the drive is level, but for its noise."""
-    assert drive.gnss is not None
-    assert drive.gnss.velocity_enu_mps is not None
-    level = drive.gnss.velocity_enu_mps.copy()
-    level[:, 2] = np.nan
-    speeds, none = (
-        dataclasses.replace(drive, gnss=dataclasses.replace(drive.gnss, velocity_enu_mps=v))
-        for v in (level, None)
-    )
-    sigmas = [
-        np.median(replay(run, mode="fixed", calibrate=calibrate).estimate.slip_sigma)
-        for run in (drive, speeds, none)
-    ]
-    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.05)
-    assert sigmas[1] < sigmas[2]
-
-
-def test_a_velocity_of_two_axes_and_an_endless_sigma_are_refused() -> None:
-    with pytest.raises(DataError, match="velocity"):
-        checked_fix(0, np.zeros(3), np.full(3, 0.1), np.zeros(2), 0.1, None)
-    with pytest.raises(DataError, match="sigma"):
-        checked_fix(0, np.zeros(3), np.array([np.inf, np.inf, 1.0]), None, np.nan, None)
 
 
 def with_wheels(recording: Recording, more_mps: np.ndarray) -> Recording:
