@@ -303,14 +303,6 @@ class DeadReckoning:
         vars(self).pop("_columns", None)
         self._confirmed = 0
 
-    def seems_turned(self, yaw_sigma_rad: float, scale: float) -> bool | None:
-        """Whether motion and fixes show another heading than the filter's, confirmed or not; None where the
-        path is too short to tell.
-        """
-        if self.fit(scale, TURN_SIGMA_RAD) is None:
-            return None
-        return self._heading_error(yaw_sigma_rad, scale) is not None
-
     def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
         fit = self.fit(scale, TURN_SIGMA_RAD)
         if fit is None:

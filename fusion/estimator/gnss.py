@@ -308,8 +308,7 @@ class GnssUpdater:
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
         self.track.restart()
-        if self.skid.friction is not None:
-            self.skid.friction.restart()
+        self.skid.restart()
         self.turned += 1
         return True
 
@@ -412,14 +411,10 @@ class GnssUpdater:
         return velocity if usable else None
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
-        """Whether the fixes just rejected refute the wheels, and not the heading; see
-        `SkidDetector.test_wheels`.
-        """
+        """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""
         refused = [off for off, _ in self.gate.rejected]
         sigma_m = fix.horizontal_sigma_m
-        yaw_sigma = math.sqrt(float(chain.covariance()[2, 2]))
-        turned = self.track.seems_turned(yaw_sigma, self.scale)
-        if turned or (turned is None and not self.skid.rate_m2ps) or not self.track.smooth_at(fix.t_ns):
+        if not self.track.smooth_at(fix.t_ns):
             return False
         if not self.skid.test_wheels(chain, k, self.last_used_ns, refused, sigma_m, noise):
             return False

@@ -85,6 +85,7 @@ class ImuMounting:
         self._imu.mounting_rad = self.known.rad
         if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
             return False
+        self._skid.restart()
         chain.restart(self._doubt(chain.dim, bias.vector()))
         return True
 

@@ -120,6 +120,12 @@ class SkidDetector:
         chain.smooth(chain.last - begin + 1)
         return True
 
+    def restart(self) -> None:
+        """Forget the skid: it was the heading, or the angle of the IMU, that the fixes refuted."""
+        self.rate_m2ps = 0.0
+        if self.friction is not None:
+            self.friction.restart()
+
     def undo(self, chain: Chain) -> None:
         """Undo the last refutation: inflated wheels do not lead to the fix either."""
         self.rate_m2ps, passed = self._before
