@@ -264,7 +264,7 @@ class LearnedNumbers:
     def _corrections(self, known: Knowledge) -> Array:
         """The numbers (4,) of `CORRECTED`: as known before, but where the drive clearly shows others.
 
-        At one speed an antenna further ahead and fixes that come earlier cannot be told apart: what is shown
+        At one speed an antenna further ahead and fixes that come earlier look alike: what is shown
         is conditional on those numbers being as before that the drive does not refute.
         """
         mean, before = known.mean[CORRECTED], self._before.mean[CORRECTED]

@@ -68,8 +68,8 @@ def verdict_line(d: GapDiagnosis) -> str:
         if d.detection.p_value <= d.significance:
             return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
         if d.drives is not None and d.drives.limits():
-            told = f"which cover {percent(d.drives.covered)} of the time of these drives"
-            return f"No gap as far as the references tell, {told} ({_test(d)})."
+            covered = f"which cover {percent(d.drives.covered)} of the time of these drives"
+            return f"No gap as far as the references tell, {covered} ({_test(d)})."
         like = "the references among themselves" if d.references else "the twin's own runs"
         return f"No gap: the runs differ no more than {like} ({_test(d)})."
     if verdict.kind == "unknown":

@@ -51,7 +51,7 @@ def plot_causes(sheet: Sheet, d: GapDiagnosis) -> None:
     kinds = ["named" if c.effect in d.verdict.named else "alike" if c.effect in alike else "" for c in causes]
     for kind, label, colour in (
         ("named", "named", style.AFTER),
-        ("alike", "cannot be told from a named one", style.MODE_COLOURS["innovation"]),
+        ("alike", "looks like a named one", style.MODE_COLOURS["innovation"]),
         ("", "other", style.NEUTRAL),
     ):
         rows = np.flatnonzero(np.array(kinds) == kind).astype(float)
