@@ -251,10 +251,10 @@ def data_folders() -> list[Path]:
 
 def cache_folder() -> Path | None:
     """The folder that downloads go to, as the operating system has it; None where the user has no home."""
-    import pooch
+    import platformdirs
 
     try:
-        folder = Path(pooch.os_cache("terrafusion"))
+        folder = Path(platformdirs.user_cache_dir("terrafusion"))
     except RuntimeError:  # neither HOME nor an entry for the user
         return None
     return folder if folder.is_absolute() else None

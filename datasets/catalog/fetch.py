@@ -1,18 +1,16 @@
 """Download recordings of the catalogue: by hash, with resume, never twice.
 
-This module imports requests and pooch: import it where it is used.
+This module imports requests: import it where it is used.
 """
 
 import difflib
-import logging
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
-import pooch
 import requests
 
 from terrafusion.datasets.catalog.catalog import (
@@ -22,9 +20,10 @@ from terrafusion.datasets.catalog.catalog import (
     cache_folder,
     data_folders,
     load_catalog,
+    sha256_of,
 )
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.files import unwritable
+from terrafusion.datasets.core.files import unwritable, write_atomically
 
 CONNECT_S, SILENCE_S = 10.0, 30.0
 """A server that does not answer, or falls silent, for longer has failed."""
@@ -112,25 +111,24 @@ def _brought(entry: CatalogFile, folder: Path) -> Path | None:
     here = at_hand(entry, data_folders()) if there is None else None
     if here is None:
         return there
-    target = folder / entry.file
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(here, target)
-    except OSError as error:
-        raise unwritable(target, error) from None
-    return target
+    return write_atomically(folder / entry.file, lambda target: shutil.copyfile(here, target))
 
 
 def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Path:
+    target = folder / entry.file
+    part = target.with_name(f"{target.name}.part")
     try:
-        with _quiet_pooch():
-            path = pooch.retrieve(
-                entry.url(),
-                f"sha256:{entry.sha256}",
-                fname=entry.file,
-                path=folder,
-                downloader=_Resuming(entry, folder / f"{entry.file}.part", progress),
-            )
+        part.parent.mkdir(parents=True, exist_ok=True)
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                _continue(entry, part, progress or (lambda entry, done: None))
+                break
+            except (requests.ConnectionError, requests.Timeout):
+                if attempt == ATTEMPTS:
+                    raise
+        if sha256_of(part) == entry.sha256:
+            os.replace(part, target)
+            return target
     except requests.RequestException as error:
         raise DataError(
             f"cannot be downloaded from {entry.url()}: {_reason(error)}",
@@ -138,26 +136,15 @@ def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Pa
             remedy="run it again, which goes on where it stopped, or put the file into TERRAFUSION_DATA",
         ) from None
     except OSError as error:
-        raise unwritable(folder / entry.file, error) from None
-    except ValueError:  # pooch found another hash, and has removed what came
-        raise DataError(
-            f"what came from {entry.url()} has another SHA-256 than the catalogue",
-            file=entry.file,
-            remedy="it was thrown away; try again, and if it stays so, report it",
-        ) from None
-    return Path(path)
-
-
-@contextmanager
-def _quiet_pooch() -> Iterator[None]:
-    """Silences pooch, which reports each download on standard error."""
-    logger = pooch.get_logger()
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+        if at_hand(entry, [folder]) is not None:  # another process was faster
+            return target
+        raise unwritable(target, error) from None
+    part.unlink(missing_ok=True)
+    raise DataError(
+        f"what came from {entry.url()} has another SHA-256 than the catalogue",
+        file=entry.file,
+        remedy="it was thrown away; try again, and if it stays so, report it",
+    )
 
 
 class _BrokenOffError(requests.ConnectionError):
@@ -173,50 +160,38 @@ def _reason(error: requests.RequestException) -> str:
     return str(error) if isinstance(error, _BrokenOffError) else "the server cannot be reached"
 
 
-class _Resuming:
-    """A downloader for pooch that keeps what has come in a `.part` file and asks only for the rest."""
+def _continue(entry: CatalogFile, part: Path, progress: Progress) -> None:
+    """One connection: put into the part what is missing of it."""
+    part.touch()
+    have = part.stat().st_size
+    if have > entry.bytes:
+        os.truncate(part, 0)
+        have = 0
+    if have == entry.bytes:
+        return
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
+    with requests.get(entry.url(), headers=headers, stream=True, timeout=(CONNECT_S, SILENCE_S)) as answer:
+        answer.raise_for_status()
+        if answer.status_code != requests.codes.partial_content:
+            have = 0  # a server that does not resume sends the whole file
+        # At its place, not at the end: of two processes, each may write what the other has written.
+        with part.open("r+b") as out:
+            out.seek(have)
+            _receive(entry, answer, out, have, progress)
 
-    def __init__(self, entry: CatalogFile, part: Path, progress: Progress | None) -> None:
-        self.entry, self.part = entry, part
-        self.progress = progress or (lambda entry, done: None)
 
-    def __call__(self, url: str, output_file: str, pooch: Any) -> None:
-        """Fetch `url` into `output_file`, in several attempts where the connection breaks."""
-        self.part.parent.mkdir(parents=True, exist_ok=True)
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                self._go_on(url)
-                break
-            except (requests.ConnectionError, requests.Timeout):
-                if attempt == ATTEMPTS:
-                    raise
-        shutil.move(self.part, output_file)
-
-    def _go_on(self, url: str) -> None:
-        """One connection: append to the part what is missing of it."""
-        have = self.part.stat().st_size if self.part.exists() else 0
-        if have > self.entry.bytes:
-            have = 0
-        if have == self.entry.bytes:
-            return
-        headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-"} if have else {})
-        with requests.get(url, headers=headers, stream=True, timeout=(CONNECT_S, SILENCE_S)) as answer:
-            answer.raise_for_status()
-            if answer.status_code != requests.codes.partial_content:
-                have = 0  # a server that does not resume sends the whole file
-            with self.part.open("ab" if have else "wb") as out:
-                self._receive(answer, out, have)
-
-    def _receive(self, answer: requests.Response, out: Any, have: int) -> None:
-        answer.raw.enforce_content_length = False  # else the last, short block of a cut connection is lost
-        try:
-            for block in answer.iter_content(BLOCK):
-                have += len(block)
-                out.write(block[: len(block) - max(have - self.entry.bytes, 0)])
-                self.progress(self.entry, min(have, self.entry.bytes))
-                if have > self.entry.bytes:
-                    break  # more than in the catalogue: the hash will not match
-        except (requests.ConnectionError, requests.exceptions.ChunkedEncodingError):
-            pass  # reported below
-        if have < self.entry.bytes:
-            raise _BrokenOffError(f"the connection broke after {have} of {self.entry.bytes} bytes")
+def _receive(
+    entry: CatalogFile, answer: requests.Response, out: BinaryIO, have: int, progress: Progress
+) -> None:
+    answer.raw.enforce_content_length = False  # else the last, short block of a cut connection is lost
+    try:
+        for block in answer.iter_content(BLOCK):
+            have += len(block)
+            out.write(block[: len(block) - max(have - entry.bytes, 0)])
+            progress(entry, min(have, entry.bytes))
+            if have > entry.bytes:
+                break  # more than in the catalogue: the hash will not match
+    except (requests.ConnectionError, requests.exceptions.ChunkedEncodingError):
+        pass  # reported below
+    if have < entry.bytes:
+        raise _BrokenOffError(f"the connection broke after {have} of {entry.bytes} bytes")

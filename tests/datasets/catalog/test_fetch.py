@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import os
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,6 +15,7 @@ import pytest
 
 from terrafusion.datasets.catalog import catalog, fetch
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.scratch import is_part
 
 CONTENT = bytes(range(256)) * 2000
 
@@ -188,6 +190,53 @@ def test_a_spoilt_part_is_found_out(server: type[Server], tmp_path: Path) -> Non
     with pytest.raises(DataError, match="another SHA-256"):
         get("good", tmp_path / "to")
     assert get("good", tmp_path / "to")[0].path.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("left", [CONTENT[::-1][:700], CONTENT + b"more"], ids=["shorter", "longer"])
+def test_a_part_is_written_over_by_a_server_that_cannot_resume(
+    left: bytes, server: type[Server], tmp_path: Path
+) -> None:
+    part = tmp_path / "to" / "toys" / "stubborn.bin.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(left)
+    assert get("stubborn", tmp_path / "to")[0].path.read_bytes() == CONTENT
+
+
+def test_two_at_once_get_the_same_file(server: type[Server], tmp_path: Path) -> None:
+    """The second goes on from the part of the first, which goes on, too."""
+    to, second = tmp_path / "to", list[fetch.Fetched]()
+
+    def meanwhile(entry: catalog.CatalogFile, done: int) -> None:
+        if not second:
+            second.extend(fetch.fetch(["toys/good"], to))
+
+    (first,) = get("good", to, progress=meanwhile)
+    assert first.path == second[0].path
+    assert first.path.read_bytes() == CONTENT
+    assert [p.name for p in first.path.parent.iterdir()] == ["good.bin"]
+
+
+@pytest.mark.parametrize("local", [True, False])
+def test_a_file_has_its_name_only_when_it_is_whole(
+    local: bool, server: type[Server], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever moment a kill comes at: no name but the part's is seen before the file is whole."""
+    if local:
+        (tmp_path / "mine" / "toys").mkdir(parents=True)
+        (tmp_path / "mine" / "toys" / "good.bin").write_bytes(CONTENT)
+        monkeypatch.setenv(catalog.DATA_VARIABLE, str(tmp_path / "mine"))
+    seen: list[set[str]] = []
+    real = os.replace
+
+    def replace(source: Path, target: Path) -> None:
+        seen.append({path.name for path in (tmp_path / "to").rglob("*.*")})
+        assert Path(source).read_bytes() == CONTENT
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    get("good", tmp_path / "to")
+    assert len(seen) == 1
+    assert all(is_part(name) for name in seen[0])
 
 
 def test_no_server(server: type[Server], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

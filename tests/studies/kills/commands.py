@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
+import functools
+import hashlib
 import importlib
+import os
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+
+from terrafusion.datasets.catalog import catalog
+from terrafusion.datasets.core.recording import Recording
 
 SCENARIO = """\
 description: a short drive with turns both ways
@@ -38,13 +47,17 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "gap": ("gap", "log", "--effects", "wheel_radius,gyro_bias", "--out", "out/run"),
     "benchmark": ("benchmark", "--only", "firm=1", "--jobs", "1", "--out", "out/run"),
-    "init": ("init", "log", "--track", "0.62", "--out", "out/robot.yaml"),
+    "init": ("init", "log", "--track", "0.62", "--out", "out/robot.yaml", "--force"),
     "study": ("study", "--quick", "--seeds", "1", "--jobs", "1", "--out", "out/run"),
     "gap-blind": ("gap-blind", "--quick", "--no-opponent", "--out", "out/run"),
     "policy fit": ("policy", "fit", "--seeds", "1", "--ground", "asphalt", "--out", "out/policy.yaml"),
     "terrain train": ("terrain", "train", "--seeds", "1", "--jobs", "1", "--out", "out/model.yaml"),
+    "demo": ("demo", "--drives", "1", "--jobs", "1", "--out", "out/run"),
+    "inspect": ("inspect", "log", "--report", "out/log.html"),
+    "fetch": ("fetch", "toys/far", "--to", "out/run"),
+    "fetch of local files": ("fetch", "toys/near", "--to", "out/run"),
 }  # fmt: skip
-"""Commands that run for long, with little to do. `demo` is simulate and replay; `live` writes no file."""
+"""Commands that run for long, with little to do. `live`, `allan` and `self-check` write no file."""
 
 
 def prepared(work: Path) -> Path:
@@ -63,8 +76,8 @@ def prepared(work: Path) -> Path:
 HEAVY = ("gtsam", "pandas", "matplotlib.pyplot", "scipy.optimize", "pyarrow.parquet", "jinja2", "joblib")
 
 
-def preload() -> None:
-    """What commands import, so that children start with it."""
+def preload(work: Path) -> None:
+    """What commands import and fetch, and their shortened work, so that children start with it."""
     for name in HEAVY:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
@@ -72,6 +85,8 @@ def preload() -> None:
         importlib.import_module(f"terrafusion.{part}")
     _shorten_training()
     _shorten_blind_check()
+    _shorten_demo(str(work / "drive.yaml"))
+    _offer_files(work / "catalogue")
 
 
 def _shorten_training() -> None:
@@ -90,3 +105,46 @@ def _shorten_blind_check() -> None:
 
     plan.QUICK = plan.CheckSize(1, *[0] * (len(dataclasses.fields(plan.CheckSize)) - 1))
     plan.USUAL_REFERENCES, plan.RUNS = 3, 1
+
+
+def _offer_files(folder: Path) -> None:
+    """A catalogue of two files for this process and its children: one on a server here, one at hand."""
+    content = "".join(f"{i},{i * i}\n" for i in range(200_000)).encode()
+    digest = hashlib.sha256(content).hexdigest()
+    for name in ("far", "near"):
+        (folder / name / "toys").mkdir(parents=True, exist_ok=True)
+        (folder / name / "toys" / f"{name}.csv").write_bytes(content)
+    handler = functools.partial(_Quiet, directory=str(folder / "far"))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    (folder / "catalog.yaml").write_text(
+        "toys: {title: Toys, holds: bytes, licence: CC0-1.0, citation: '', homepage: '', format: ''}\n"
+    )
+    with (folder / "catalog_files.csv").open("w", newline="") as out:
+        writer = csv.writer(out)
+        writer.writerow(catalog.FILE_COLUMNS)
+        for name in ("far", "near"):
+            file, url = f"toys/{name}.csv", f"http://127.0.0.1:{server.server_address[1]}"
+            writer.writerow(["toys", name, file, url, "", file, digest, len(content)])
+    os.environ[catalog.CATALOG_VARIABLE] = str(folder)
+    os.environ[catalog.DATA_VARIABLE] = str(folder / "near")
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    """Serves files without a word."""
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def _shorten_demo(scenario: str) -> None:
+    """The demo drives a short scenario, in this process and its children."""
+    from terrafusion.fusion.cli import demo
+    from terrafusion.twin import simulate as module
+
+    simulate, demo.OUTAGE_START_S, demo.OUTAGE_S = module.simulate, 8.0, 6.0
+
+    def short(name: str, **options: object) -> Recording:
+        return simulate(scenario if name == "demo" else name, **options)  # type: ignore[arg-type]
+
+    module.simulate = short  # type: ignore[assignment]

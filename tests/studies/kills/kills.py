@@ -104,8 +104,8 @@ def main() -> None:
     parser.add_argument("--commands", nargs="*", default=list(COMMANDS))
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    preload()
     work, kept = prepared(given.out.absolute() / "work"), given.out / "rows.json"
+    preload(work)
     rows = json.loads(kept.read_text()) if kept.is_file() else {}
     for name in given.commands:
         row = rows.setdefault(name, {"troubles": {}})
