@@ -97,7 +97,10 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     completion.answer_shells()
     try:
-        status = app(prog_name="terrafusion", standalone_mode=False)
+        try:
+            status = app(prog_name="terrafusion", standalone_mode=False)
+        except KeyboardInterrupt:
+            status = INTERRUPTED
         if status == INTERRUPTED:  # before the command began
             print("error: interrupted; nothing was written", file=sys.stderr)
         sys.exit(status)

@@ -37,6 +37,18 @@ def test_wrong_usage_is_one_line_with_the_nearest_match(
         assert word in outcome.err
 
 
+def test_an_interrupt_while_options_are_built_is_one_line(
+    terrafusion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("typer.main.get_command", interrupted)
+    outcome = terrafusion("replay", "log")
+    assert (outcome.status, outcome.out) == (130, "")
+    assert outcome.err == "error: interrupted; nothing was written\n"
+
+
 @pytest.mark.parametrize("words", ["-h", "replay -h", "terrain -h", "policy fit -h", "", "policy"])
 def test_help(words: str, terrafusion) -> None:
     outcome = terrafusion(*words.split())
