@@ -18,7 +18,7 @@ DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").
 
 SLOW = ("terrain train", "terrain eval", "policy fit")
 """Commands that take longer than a test should: only their options are checked."""
-FEWER = {"demo": ["--drives", "2"]}
+FEWER = {"demo": ["--drives", "1"]}
 """Commands that are run with less work than they do by default."""
 
 

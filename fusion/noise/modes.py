@@ -1,6 +1,7 @@
 """Tuning of the estimator modes, as found by `python -m tests.studies.mode_tuning`."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -85,6 +86,12 @@ class ModesFile(ModeTuning):
     made_by: str
 
 
+@functools.cache
+def _shipped() -> ModeTuning:
+    with resources.as_file(resources.files("terrafusion.fusion.noise") / "modes.yaml") as path:
+        return load_modes(path)
+
+
 def load_modes(path: Path | None = None) -> ModeTuning:
     """The tuning file `path`, or the one shipped with the library.
 
@@ -92,7 +99,6 @@ def load_modes(path: Path | None = None) -> ModeTuning:
         ConfigError: unknown or missing key, wrong type, out of range.
     """
     if path is None:
-        with resources.as_file(resources.files("terrafusion.fusion.noise") / "modes.yaml") as shipped:
-            return load_modes(shipped)
+        return _shipped()
     content = structure(ModesFile, read_yaml(path), file=path, complete=True)
     return ModeTuning(**{f.name: getattr(content, f.name) for f in dataclasses.fields(ModeTuning)})

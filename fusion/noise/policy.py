@@ -137,6 +137,12 @@ class PolicyFile:
     made_by: str = ""
 
 
+@functools.cache
+def _shipped() -> Policy:
+    with resources.as_file(resources.files("terrafusion.fusion.noise") / "policy.yaml") as path:
+        return load_policy(path)
+
+
 def load_policy(path: Path | None = None) -> Policy:
     """The policy file `path`, or the one shipped with the library.
 
@@ -144,8 +150,7 @@ def load_policy(path: Path | None = None) -> Policy:
         ConfigError: unknown or missing key, wrong type, out of range, no `unknown` class.
     """
     if path is None:
-        with resources.as_file(resources.files("terrafusion.fusion.noise") / "policy.yaml") as shipped:
-            return load_policy(shipped)
+        return _shipped()
     content = structure(PolicyFile, read_yaml(path), file=path)
     if "unknown" not in content.classes:
         raise ConfigError("'classes' has no 'unknown'", file=path, remedy="add the noise of unknown ground")

@@ -9,6 +9,7 @@ another.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
@@ -184,6 +185,12 @@ class TerrainModelFile:
     scores: dict[str, Any]
 
 
+@functools.cache
+def _shipped() -> TerrainModel:
+    with resources.as_file(resources.files("terrafusion.fusion.terrain") / "model.yaml") as path:
+        return load_terrain_model(path)
+
+
 def load_terrain_model(path: Path | None = None) -> TerrainModel:
     """The model file `path`, or the one shipped with the library.
 
@@ -191,8 +198,7 @@ def load_terrain_model(path: Path | None = None) -> TerrainModel:
         ConfigError: unknown or missing key, wrong shape, a matrix that is no covariance.
     """
     if path is None:
-        with resources.as_file(resources.files("terrafusion.fusion.terrain") / "model.yaml") as shipped:
-            return load_terrain_model(shipped)
+        return _shipped()
     content = structure(TerrainModelFile, read_yaml(path), file=path)
     refuse(_problems(content), path)
     return TerrainModel(

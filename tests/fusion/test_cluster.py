@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from signal import SIGKILL
 from typing import Any
 
 import pytest
@@ -36,7 +34,7 @@ def two_workers(address: str) -> Iterator[Callable[..., None]]:
     """Two workers, and what kills both."""
     with worker(address) as one, worker(address) as two:
         wait_for_workers(address, 2)
-        yield lambda *_: [os.kill(child.pid, SIGKILL) for child in (one, two) if child.poll() is None]
+        yield lambda *_: [child.kill() for child in (one, two)]
 
 
 def killed_and_resumed(address: str, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> Any:

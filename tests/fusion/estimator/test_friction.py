@@ -117,8 +117,8 @@ def test_the_grip_of_ice_is_found(ice: Recording) -> None:
 
 
 def test_without_fixes_friction_leads_where_wheels_do_not(ice: Recording) -> None:
-    """12 s without fixes, six times: 2.2 m at the end where wheels lead to 7.1 (geometric means)."""
-    logs = [aided_by_truth(dataclasses.replace(ice, gnss=None), seed) for seed in (1, 2, 3)]
+    """12 s without fixes, four times: 2 m at the end where wheels lead to 7 (geometric means)."""
+    logs = [aided_by_truth(dataclasses.replace(ice, gnss=None), seed) for seed in (1, 2)]
 
     def end_m(mode: str) -> float:
         found = [

@@ -67,8 +67,10 @@ def yaw_errors(result: ReplayResult) -> np.ndarray:
     return np.abs(wrap_angle(errors.estimate_yaw_rad - errors.reference_yaw_rad))
 
 
-@pytest.mark.parametrize("heading_deg", [0.0, 137.0, -100.0])
-@pytest.mark.parametrize("terrain", ["asphalt", "loose_sand"])
+@pytest.mark.parametrize(
+    ("heading_deg", "terrain"),
+    [(0.0, "asphalt"), (137.0, "asphalt"), (-100.0, "loose_sand"), (137.0, "loose_sand")],
+)
 def test_the_path_lies_where_the_robot_was_whatever_its_heading(heading_deg: float, terrain: str) -> None:
     result = replayed(heading_deg, terrain)
     errors = result.scores.errors
@@ -86,8 +88,7 @@ def test_the_path_lies_where_the_robot_was_whatever_its_heading(heading_deg: flo
     )
 
 
-@pytest.mark.parametrize("heading_deg", [137.0, -100.0])
-@pytest.mark.parametrize("until_s", [65.0, 1e9])
+@pytest.mark.parametrize(("heading_deg", "until_s"), [(137.0, 65.0), (-100.0, 1e9)])
 def test_compass_and_barometer_follow_onto_the_map(heading_deg: float, until_s: float) -> None:
     """What they told in the local frame is left there: heading and height are the map's from the first
     moment, and what they tell from then on agrees with it, also once the fixes are gone again."""

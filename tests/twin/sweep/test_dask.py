@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import signal
 import socket
@@ -133,7 +132,7 @@ def test_dead_workers_are_reported_and_nothing_finished_is_lost(
 
             def kill(share: float) -> None:
                 if share > 0.2:
-                    only.send_signal(signal.SIGKILL)
+                    only.kill()
 
             with pytest.raises(TerrafusionError, match=r"no workers any more; start some: .* continues"):
                 run_sweep(sweep, tmp_path / "out", backend="dask", address=address, progress=kill)
@@ -149,11 +148,11 @@ def test_the_work_of_a_dead_worker_is_done_by_others(tmp_path: Path) -> None:
     whole = run_sweep(sweep, tmp_path / "whole")
     with scheduler(tmp_path) as address, worker(address), worker(address) as mortal:
         wait_for_workers(address, 2)
-        kill = functools.partial(mortal.send_signal, signal.SIGKILL)
         table = run_sweep(
-            sweep, tmp_path / "out", backend="dask", address=address, progress=lambda share: kill()
+            sweep, tmp_path / "out", backend="dask", address=address, progress=lambda share: mortal.kill()
         )
-        assert mortal.wait(PATIENCE_S) == -signal.SIGKILL
+        mortal.join(PATIENCE_S)
+        assert mortal.exitcode == -signal.SIGKILL
     assert table.equals(whole)
 
 
@@ -172,7 +171,7 @@ def test_a_lost_scheduler_is_reported(tmp_path: Path) -> None:
         wait_for_workers(address, 1)
 
         def kill(share: float) -> None:
-            boss.send_signal(signal.SIGKILL)
+            boss.kill()
 
         begun = time.monotonic()
         with pytest.raises(TerrafusionError, match=r"lost|no workers any more"):

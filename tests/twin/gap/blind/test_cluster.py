@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,6 @@ def test_a_cluster_that_is_killed_in_the_middle_loses_no_answer(
     """Answers that were given are kept, the others are asked for on the next cluster."""
     monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)
     monkeypatch.setattr(executors, "WORKERLESS_S", 2.0)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]))
     whole = run_blind_check(tmp_path / "whole", fake.slow_guess, scale=SMALL)
     out = tmp_path / "out"
 
@@ -43,7 +40,7 @@ def test_a_cluster_that_is_killed_in_the_middle_loses_no_answer(
 
             def kill(share: float) -> None:
                 for mortal in (one, other):
-                    mortal.send_signal(signal.SIGKILL)
+                    mortal.kill()
 
             with pytest.raises(TerrafusionError, match=r"no workers any more; start some: .* continues"):
                 check(address, kill)
