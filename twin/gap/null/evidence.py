@@ -15,6 +15,7 @@ from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import Soils, prepared, starting_model, with_common_channels
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
+from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
 from terrafusion.twin.gap.null.reference_soil import all_residuals, set_soil
 from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
@@ -106,7 +107,11 @@ def gather_evidence(
         usual = reference_loudness(errors[R:])
         every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
         white = list(threads.map(lambda run: whitened(run, noise), every))
-    clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
+    first_sigma = initial_state_sigma(candidates)
+    white, patches = with_patches(every, white, len(references), noise, first_sigma, jobs)
+    more = patchier(patches, len(references))
+    notes += [PATCHIER.format(more)] if more is not None else []
+    clipped = limit_outliers(white[:R], white[R:], first_sigma, jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
         model, candidates, channels, noise, *clipped, every[:R], every[R:], limit, linearised,

@@ -56,6 +56,7 @@ class RunResiduals:
         soil: (S,) the run's soil, in typical sizes from the model's, in the order of `SOIL_SIGMAS`.
         error: (n,) measured less predicted, linearised about that soil.
         by_state, by_effect, by_nuisance, by_pose: (n, T), (n, K), (n, G) and (n, 3) derivatives.
+        by_patch: (n, D) those by patches of ground in the window.
     """
 
     log: PreparedLog
@@ -65,6 +66,7 @@ class RunResiduals:
     by_effect: list[Array]
     by_nuisance: list[Array]
     by_pose: list[Array]
+    by_patch: list[Array]
 
     def without_nuisance(self) -> Self:
         """Without the nuisance basis: half of all columns, which only the scores need."""
@@ -90,6 +92,7 @@ class WhitenedRun:
         gram: (T + P + 1, T + P + 1) inner products of [state, effect and nuisance, error].
         rows: (n, T + P + 1) those columns; `channel`, `time_s` and `window` (n,) of each sample.
         pose_basis: (n, 3) orthonormal columns in each window, spanned by the poses.
+        patch_basis: (n, D) columns U in each window: 1 - U U' whitens patches of ground (see `patchiness`).
         seconds: length.
         states: T.
         state_gain: (T, n) states by an error, as ridge regression has them; no rows where nothing is clipped.
@@ -101,6 +104,7 @@ class WhitenedRun:
     gram: Array
     rows: NDArray[np.float32]
     pose_basis: Array
+    patch_basis: Array
     channel: Indices
     time_s: Array
     window: Indices
@@ -144,11 +148,28 @@ class WhitenedRun:
 
     def without_poses(self, error: Array) -> Array:
         """A whitened error (n,) with the poses projected out."""
+        return _less(error, self.pose_basis, self.window)
+
+    def without_patches(self, columns: Array) -> Array:
+        """Columns (n, k) or an error (n,) without poses, white given the patches of ground."""
+        return _less(columns, self.patch_basis, self.window)
+
+    def with_patches(self, error: Array) -> Array:
+        """The error (n,) that `without_patches` made this one of."""
         out = error.copy()
-        for k in np.unique(self.window):
+        for k in np.unique(self.window) if self.patch_basis.shape[1] else ():
             mine = self.window == k
-            out[mine] -= self.pose_basis[mine] @ (self.pose_basis[mine].T @ out[mine])
+            U = self.patch_basis[mine]
+            out[mine] += U @ ((U.T @ out[mine]) / (1.0 - np.square(U).sum(axis=0)))
         return out
+
+
+def _less(columns: Array, basis: Array, window: Indices) -> Array:
+    out = columns.copy()
+    for k in np.unique(window) if basis.shape[1] else ():
+        mine = window == k
+        out[mine] -= basis[mine] @ (basis[mine].T @ out[mine])
+    return out
 
 
 @dataclass(eq=False)
@@ -214,8 +235,10 @@ def residuals_from(
         own = _sensor_states(observed.channel, s.value, model.vehicle)
         by_state.append(np.hstack([s.by_effect[:, soil], own]))
         by_nuisance.append(nuisance_columns(log, model, observed, s.heading, channels))
-    by_effect, by_pose = [s.by_effect for s in found], [s.by_pose for s in found]
-    return RunResiduals(log, np.zeros(len(soil)), error, by_state, by_effect, by_nuisance, by_pose)
+    K = len(candidates.keys)
+    by_effect, by_patch = [s.by_effect[:, :K] for s in found], [s.by_effect[:, K:] for s in found]
+    by_pose = [s.by_pose for s in found]
+    return RunResiduals(log, np.zeros(len(soil)), error, by_state, by_effect, by_nuisance, by_pose, by_patch)
 
 
 def _sensor_states(channel: str, predicted: Array, vehicle: VehicleParams) -> Array:
@@ -291,7 +314,7 @@ def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], colum
 
 def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Array) -> Array:
     """A whitened error (n,) in the units of the channels."""
-    out = np.empty(len(error))
+    error, out = run.with_patches(error), np.empty(len(error))
     sigma = [noise_sigma(o, noise[o.channel]) for o in run.log.observed]
     for i, rows, places in sample_map(run.log).equally_spaced:
         observed = run.log.observed[i]
@@ -320,7 +343,7 @@ def projected(run: RunResiduals, white: Array) -> WhitenedRun:
         own = columns[mine]
         out[mine] = own - Q @ (Q.T @ own)
     return WhitenedRun(
-        run.log.name, run.log, out.T @ out, out.astype(np.float32), pose_basis, channel,
+        run.log.name, run.log, out.T @ out, out.astype(np.float32), pose_basis, pose_basis[:, :0], channel,
         np.concatenate([middle[i][rows] for i, _, rows in blocks]), window, run.log.seconds(),
         run.by_state[0].shape[1], np.zeros((0, len(window))), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
@@ -343,6 +366,7 @@ def whitened_error(
 ) -> Array:
     """Another error of the run, one array a channel, whitened (n,), poses projected out, outliers clipped."""
     out = white.without_poses(whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0])
+    out = white.without_patches(out)
     return clip_outliers(white, out) if clip else out
 
 

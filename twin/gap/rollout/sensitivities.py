@@ -35,6 +35,7 @@ from terrafusion.twin.gap.rollout.batch import (
     simulate_lanes,
 )
 from terrafusion.twin.gap.rollout.delay import delayed_samples, without_delays
+from terrafusion.twin.gap.rollout.ground_patches import patch_columns
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
 
 STEP = 0.3
@@ -54,20 +55,22 @@ class Linearisation:
         fine: (N, Y) outputs at every grid sample of all windows.
         by_effect, by_pose: (n, Y, K) and (n, Y, 3) derivatives at every `COARSE_STEP`-th sample by the
             candidates' columns, in typical sizes, and by the pose of the window's start.
+        by_patch: (n, Y, D) derivatives by patches of ground along the path of the window.
         heading: (n,) yaw of the body.
     """
 
     start: Array
     fine: Array
     by_effect: Array
+    by_patch: Array
     by_pose: Array
     heading: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """One channel: prediction (n,), derivatives by the columns (n, K), in typical sizes, and the pose (n, 3),
-    heading (n,)."""
+    """One channel: prediction (n,), derivatives by columns and patches (n, K + D), in typical sizes, and the
+    pose (n, 3), heading (n,)."""
 
     value: Array
     by_effect: Array
@@ -183,7 +186,9 @@ def linearise(
             by_effect[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
     diverged = ~np.isfinite(by_effect).all(axis=(0, 1))
     by_effect[:, :, diverged] = 0.0
-    return Linearisation(start, fine, by_effect, _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]])
+    by_patch = patch_columns(y, by_effect, coarse_counts(log), candidates, model.vehicle.body.track_m)
+    by_pose, heading = _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]]
+    return Linearisation(start, fine, by_effect, by_patch, by_pose, heading)
 
 
 def _readings(
@@ -224,9 +229,11 @@ def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitiv
     at, out = sample_map(log), []
     for observed, fine, coarse in zip(log.observed, at.fine, at.coarse, strict=True):
         value = weighted_means(fine, _channel(run.fine, observed.channel))
-        by_effect, by_pose = (
-            weighted_means(coarse, _channel(part, observed.channel)) for part in (run.by_effect, run.by_pose)
+        by_effect, by_patch, by_pose = (
+            weighted_means(coarse, _channel(part, observed.channel))
+            for part in (run.by_effect, run.by_patch, run.by_pose)
         )
+        by_effect = np.hstack([by_effect, by_patch])
         out.append(Sensitivity(value, by_effect, by_pose, run.heading[coarse[0][:, 2]]))
     return out
 
