@@ -28,6 +28,9 @@ CURVATURE_SHARE, CURVATURE_FLOOR = 0.03, 0.002
 """Error of the curvature by slip angles: share of it, and of one over the wheelbase (assumed)."""
 WANDER_SHARE = 0.1
 """How far scale and zero wander in `CORRELATED_S`, in their first sigmas (assumed)."""
+TYRE_SLIP_PER_GRADE = 0.05
+"""Slip over the grade of tyres on firm ground, where most steered robots drive: half the grip takes some two
+per cent of slip (assumed)."""
 LEAST_M = 0.02
 """Distance a keyframe below which nothing is learned."""
 
@@ -39,7 +42,9 @@ def front_ratio(rig: Rig) -> float:
 
 
 def policy_of(rig: Rig, policy: Policy) -> Policy:
-    """The policy for a robot that does not skid to turn: its wheels' yaw needs no scale."""
+    """The policy for a robot that does not skid to turn: its wheels' yaw needs no scale, and on ground that
+    no class describes its tyres slip little on a grade.
+    """
     if rig.steering is None:
         return policy
 
@@ -47,7 +52,9 @@ def policy_of(rig: Rig, policy: Policy) -> Policy:
         return dataclasses.replace(noise, yaw_scale_mean=0.0, yaw_scale_sigma=0.02)
 
     classes = {name: steered(noise) for name, noise in policy.classes.items()}
-    return dataclasses.replace(policy, classes=classes, fixed=steered(policy.fixed))
+    per_grade = min(policy.fixed.slip_per_grade, TYRE_SLIP_PER_GRADE)
+    fixed = dataclasses.replace(steered(policy.fixed), slip_per_grade=per_grade)
+    return dataclasses.replace(policy, classes=classes, fixed=fixed)
 
 
 def steered_turn(rig: Rig, inputs: SensorConfig) -> SteeredTurn | None:

@@ -92,6 +92,15 @@ def test_a_steered_robot_does_not_skid_to_turn() -> None:
     assert {noise.yaw_scale_mean for noise in changed.classes.values()} == {0.0}
 
 
+def test_tyres_slip_little_on_a_grade_unless_the_ground_is_known() -> None:
+    policy = load_policy()
+    changed = policy_of(rig(), policy)
+    assert changed.fixed.slip_at(0.1) - changed.fixed.slip_mean == pytest.approx(0.005)
+    assert changed.slips()[2] == pytest.approx(policy.slips()[2])
+    firm = dataclasses.replace(policy, fixed=dataclasses.replace(policy.fixed, slip_per_grade=0.01))
+    assert policy_of(rig(), firm).fixed.slip_per_grade == 0.01
+
+
 def test_a_steering_wheel_is_divided_by_its_ratio() -> None:
     own = dataclasses.replace(rig(), steering=dataclasses.replace(SPEC, ratio=20.0))
     estimator = Estimator(EstimatorConfig(own, inputs=SensorConfig(steered=True)))
