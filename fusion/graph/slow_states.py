@@ -87,13 +87,14 @@ def step(
 
     `up` (3,) is the world's up in body axes, `switch` the share of the ground that just changed.
     """
-    backwards = wheels is not None and wheels.distance_m < 0.0
-    downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
+    ahead = -1.0 if wheels is not None and wheels.distance_m < 0.0 else 1.0
+    grade = ahead * float(up[0])
+    downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * ahead * float(up[1])
     sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = math.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill)
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
-    mean = [noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]
+    mean = [noise.slip_at(grade), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]
     time_s = [slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S]
     out = markov_step(
         dt_s,

@@ -29,8 +29,9 @@ class SensorNoise:
     """Noise of the sensors on one ground (1 sigma).
 
     Slip is i = 1 - v / (omega R), positive when driving wheels outrun the robot: an Ornstein-Uhlenbeck
-    process about `slip_mean + slip_per_grade * grade` (grade: sine of the pitch, uphill positive). Yaw
-    scale is true over wheel yaw rate, less one. Side-slip is the lateral over the forward displacement.
+    process about `slip_mean + slip_per_grade * grade` (grade: sine of the slope, positive where the robot
+    drives uphill). Yaw scale is true over wheel yaw rate, less one. Side-slip is the lateral over the
+    forward displacement.
     The inflations multiply the standard deviations of the data sheet (IMU) or of the receiver's report
     (GNSS); roll and pitch rate have another one than yaw rate, as rough ground shakes them more.
     """
@@ -53,7 +54,7 @@ class SensorNoise:
         return self.gyro_inflation, self.gyro_inflation, self.gyro_yaw_inflation
 
     def slip_at(self, grade: float) -> float:
-        """Expected slip at a grade (sine of the pitch, uphill positive)."""
+        """Expected slip at a grade (sine of the slope, uphill positive)."""
         return min(max(self.slip_mean + self.slip_per_grade * grade, -0.9), 0.9)
 
 

@@ -175,7 +175,8 @@ class TerrainNoise:
             self.grounds.update(window, state, rolled_m, friction)
         self._source = "detector"
         self._apply_labels(state.t_ns)
-        self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
+        ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
+        self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
 
     def _learn_driven_slip(self, window: Window) -> None:

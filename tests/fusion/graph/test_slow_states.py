@@ -58,6 +58,12 @@ def test_a_step_keeps_the_stationary_spread(speed: float, change: float, switch:
     assert taken.sigma[SLIP] == pytest.approx(step(rolling(-speed, -change), switch=switch).sigma[SLIP])
 
 
+def test_a_robot_that_backs_down_a_slope_slips_as_one_that_drives_down() -> None:
+    up, down = np.array([0.1, 0.0, 0.995]), np.array([-0.1, 0.0, 0.995])
+    assert step(rolling(-1.0), up).mean[SLIP] == step(rolling(1.0), down).mean[SLIP] == SAND.slip_at(-0.1)
+    assert step(rolling(-1.0), down).mean[SLIP] == step(rolling(1.0), up).mean[SLIP] == SAND.slip_at(0.1)
+
+
 @given(roll=st.floats(-0.4, 0.4))
 def test_on_a_cross_slope_the_robot_slips_downhill_whichever_way_it_drives(roll: float) -> None:
     up = np.array([0.0, np.sin(roll), np.cos(roll)])  # the left side is up where roll is positive
