@@ -91,7 +91,7 @@ class MountingAngle:
         the angle changed.
         """
         self._moves.append((dt_s, rolled_m / dt_s, turn_rad, complex(*force_mps2[:2]) * dt_s))
-        if sum(dt for dt, *_ in self._moves) < WINDOW_S + dt_s:
+        if sum([move[0] for move in self._moves]) < WINDOW_S + dt_s:
             return False
         dt, speed_mps, turn, gained_mps = np.array(self._moves).T
         weight = np.ones(len(self._moves))

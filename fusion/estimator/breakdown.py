@@ -7,6 +7,7 @@ end in numbers that are not finite or in a system that has no solution.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -49,7 +50,7 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 advance(estimator, last)
             state = estimator.latest()
-            if state is not before and not np.isfinite(state.covariance.sum() + state.position_m.sum()):
+            if state is not before and not math.isfinite(state.covariance.sum() + sum(state.position_m)):
                 raise ArithmeticError("a state is not finite")
         except CallbackError as passed:
             raise passed.error from None

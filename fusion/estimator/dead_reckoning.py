@@ -323,27 +323,30 @@ class DeadReckoning:
         """The path aligned with the fixes, their sigmas times `scale`; None until its turn is known to
         `yaw_sigma_rad`.
         """
-        usable = [i for i, p in enumerate(self.pairs) if p.usable]
-        if len(usable) < 5:
+        usable = [p.usable for p in self.pairs]
+        if sum(usable) < 5:
             return None
         columns = self._columns
-        at = slice(None) if len(usable) == len(self.pairs) else usable
+        at = slice(None) if all(usable) else np.flatnonzero(usable)
         z, fix = columns.z[at], columns.fix[at]
         weight = 1.0 / (scale * columns.sigma_m[at]) ** 2
-        inlier = np.ones(len(z), dtype=bool)
+        kept, there, share = z, fix, weight
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
-            turn, information = planar_rotation(z[inlier], fix[inlier], weight[inlier])
+            turn, information = planar_rotation(kept, there, share)
             if information <= 0.0:
                 return None
             ratio = abs(turn) / information
-            middle, fix_middle = z[inlier].mean(), fix[inlier].mean()
+            middle, fix_middle = kept.sum() / len(kept), there.sum() / len(kept)
             left_m = np.abs((fix - fix_middle) - turn / information * (z - middle))
             left = _median(left_m)
             inlier = left_m <= 5.0 * left + 1e-6
-            if np.count_nonzero(inlier) < 5:
+            count = np.count_nonzero(inlier)
+            if count < 5:
                 return None
-        kept = z[inlier]
-        extent = float(np.linalg.norm(kept - kept.mean())) / math.sqrt(len(kept))
+            if count == len(kept) == len(z):
+                break
+            kept, there, share = z[inlier], fix[inlier], weight[inlier]
+        extent = float(np.linalg.norm(kept - kept.sum() / len(kept))) / math.sqrt(len(kept))
         if extent == 0.0:  # all that is left was squares where the robot stood
             return None
         sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * left / extent

@@ -42,13 +42,13 @@ class DriftWatch:
     Attributes:
         sigma_m, time_s: of the drift's Gauss-Markov process.
         fresh: fixes that show the drift came into the graph since the last test.
-        seen: time, drift (2,), m, and mean variance of it, m2.
+        seen: time, drift east and north, m, and mean variance of it, m2.
     """
 
     sigma_m: float
     time_s: float
     fresh: bool = False
-    seen: list[tuple[int, Array, float]] = field(default_factory=list)
+    seen: list[tuple[int, float, float, float]] = field(default_factory=list)
 
     def test_wheels(self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise) -> bool:
         """Refute the wheels where the drift moved too far; True where it did. `sigma_m` is that of a fix."""
@@ -73,15 +73,14 @@ class DriftWatch:
         self.seen = [one for one in self.seen if 0 < t_ns - one[0] <= WINDOW_S * 1e9]
         found = None
         east_m, north_m = drift_m.tolist()
-        for before_ns, before_m, before_m2 in self.seen:
+        for before_ns, e_m, n_m, before_m2 in self.seen:
             kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
             new_m2 = self.sigma_m**2 * (1.0 - kept**2)
             allowed_m2 = max(kept**2 * before_m2 + new_m2 - variance_m2, new_m2)
-            e_m, n_m = before_m.tolist()
             if (east_m - kept * e_m) ** 2 + (north_m - kept * n_m) ** 2 > LIMIT * allowed_m2:
-                found = before_ns, drift_m - kept * before_m
+                found = before_ns, drift_m - kept * np.array([e_m, n_m])
                 break
-        self.seen.append((t_ns, drift_m, variance_m2))
+        self.seen.append((t_ns, east_m, north_m, variance_m2))
         return found
 
     def restart(self) -> None:

@@ -10,6 +10,7 @@ state = est.latest()
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -334,8 +335,7 @@ class Estimator:
             if not self.config.inputs.planar:  # the planar link does not test the wheels
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, switch)
-        up = before.rotation[2]
-        markov = slow_states.step(dt, noise, up, *drift, switch, wheels)
+        markov = slow_states.step(dt, noise, before.rotation[2], *drift, switch, wheels)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
@@ -346,7 +346,8 @@ class Estimator:
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> State:
         chain, before = self.chain, self._solve()
-        self._frame.step(chain)
+        if chain.archive is None:  # nobody drives by a batch
+            self._frame.step(chain)
         if self.gnss.update(chain, before, self.weights.noise):
             self._solve()
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
@@ -390,10 +391,9 @@ class Estimator:
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         change = self.wheels.speed_change_mps(before_ns, t_ns)
         noise, surging = self.weights.noise, self.config.calibrate
-        increment = wheel_increment(
-            travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging
+        increment = self._jitter.applied(
+            wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging)
         )
-        increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
             return self._turn.between(before_ns, t_ns, increment, self.steering, self._covariance)
@@ -423,7 +423,7 @@ class Estimator:
         sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
         biases = before.bias.gyroscope(), before.bias.accelerometer()
         if self._stationarity.is_stationary(
-            t_ns, self.imu, self.wheels, *biases, float(np.linalg.norm(before.velocity)), sigma
+            t_ns, self.imu, self.wheels, *biases, math.sqrt(before.velocity @ before.velocity), sigma
         ):
             add_zero_velocity(self.chain, k, link)
 

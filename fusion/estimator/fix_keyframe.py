@@ -77,7 +77,10 @@ def cut_past(
     if verdict is GateDecision.REACQUIRE:
         doubt[3:6] = float(innovation_m @ innovation_m)
     else:
-        turn = covariance[:3] @ (jacobian.T @ np.linalg.solve(S, innovation_m))
+        (a, b), (c, d) = S.tolist()
+        x, y = innovation_m.tolist()
+        solved = np.array([d * x - b * y, a * y - c * x]) / (a * d - b * c)
+        turn = covariance[:3] @ (jacobian.T @ solved)
         if max(map(abs, turn.tolist())) < LARGE_TURN_RAD:
             return False
     chain.restart(doubt, k)

@@ -75,7 +75,7 @@ class ImuMounting:
             return False
         bias = chain.state(chain.last).bias
         turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
-        raw = turned(accel_mps2, -self._imu.mounting_rad)
+        raw = turned(accel_mps2, -self._imu.mounting_rad) if self._imu.mounting_rad else accel_mps2
         if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
             return False
         was_rad = self._imu.mounting_rad

@@ -317,8 +317,9 @@ def with_turn_doubt(
     In a steady turn at rate w an error s of the scale turns the heading by s w t; white noise of density
     sqrt(2 t) s w gives the same variance at every t.
     """
-    total = sum(s.dt_s for s in segments)
-    rate = abs(sum(float(s.gyro_radps[2]) * s.dt_s for s in segments)) / total if total > 0.0 else 0.0
+    total = sum([s.dt_s for s in segments])
+    turn = sum([float(s.gyro_radps[2]) * s.dt_s for s in segments])
+    rate = abs(turn) / total if total > 0.0 else 0.0
     grown = math.sqrt(min(2.0 * unaided_s, TURN_TIME_S))
     more = doubt * rate * grown / imu.gyro_noise_radps_sqrthz
     if more < 0.1 * noise.gyro_yaw_inflation:

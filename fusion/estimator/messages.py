@@ -100,7 +100,7 @@ def _gnss(estimator: Inlets, message: GnssSample) -> None:
     if m.fix:
         enu = _vector(m.enu_m, 3, "position", "gnss")
         sigma = _vector(m.sigma_enu_m, 3, "sigma", "gnss")
-        if np.isfinite(enu[:2].sum() + sigma[:2].sum()):
+        if math.isfinite(enu[0] + enu[1] + sigma[0] + sigma[1]):
             estimator.add_gnss(m.t_ns, enu, sigma, m.velocity_enu_mps, m.sigma_v_mps, m.fix)
 
 

@@ -179,7 +179,7 @@ class SkidDetector:
 def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> float:
     """Share in [0, 1) of a time in which a robot drives: 0 where neither it nor its wheels move."""
     rolled_mps = 0.0 if wheels is None else abs(wheels.distance_m) / dt_s
-    square = max(rolled_mps, float(np.linalg.norm(before.velocity))) ** 2
+    square = max(rolled_mps, math.sqrt(before.velocity @ before.velocity)) ** 2
     return square / (square + DRIVING_MPS**2)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,7 @@ COMMAND_HOLD_NS = 500_000_000
 SPINNING, STALLED = "traction lost", "motors stalled"
 
 
-@dataclass(frozen=True)
-class Travel:
+class Travel(NamedTuple):
     """Sums over a window: time, wheel travel, estimated travel along the body, its 1 sigma, least command."""
 
     seconds: float
@@ -120,17 +119,17 @@ class MotionMonitor:
         """
         if self._steps is None:
             return [None] * len(windows_s)
-        sums = np.cumsum(self._steps[:, :4], axis=0)
+        sums, commands = self._steps[:, :4].cumsum(axis=0), np.minimum.accumulate(self._steps[:, 4])
         seconds = sums[:, 0].tolist()
         found: list[Travel | None] = []
         for window_s in windows_s:
             last = bisect.bisect_left(seconds, window_s - 1e-6)
-            if last == len(seconds) or math.isnan(sums[last, 1]):
+            total, rolled, moved, sigma = sums[last].tolist() if last < len(seconds) else [math.nan] * 4
+            if math.isnan(rolled):
                 found.append(None)
                 continue
-            total, rolled, moved, sigma = sums[last].tolist()
             noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
-            found.append(Travel(total, rolled, moved, noise, float(self._steps[: last + 1, 4].min())))
+            found.append(Travel(total, rolled, moved, noise, float(commands[last])))
         return found
 
     def _commanded(self, t_ns: int) -> float:

@@ -1,5 +1,6 @@
 """Gauss-Markov steps of the linear states; see `datasets.core.gauss_markov`."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,9 @@ from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
+
+_decay = functools.lru_cache(maxsize=256)(markov_decay)
+"""Steps and correlation times hardly change from one keyframe to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +41,14 @@ class MarkovStep:
 
 
 def markov_step(
-    dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: ArrayLike, forget: ArrayLike = 0.0
+    dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: float | tuple[float, ...], forget: ArrayLike = 0.0
 ) -> MarkovStep:
-    """Exact step over `dt_s` of processes with the given moments and correlation times.
+    """Exact step over `dt_s` of processes with the given moments and correlation times (n,).
 
     `forget` in [0, 1] is the probability that the process has just restarted, as slip does where the
     ground changes.
     """
     means, sigmas = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
-    kept = 1.0 - np.clip(np.asarray(forget, dtype=float), 0.0, 1.0)
-    decay = kept * markov_decay(dt_s, time_s)
+    kept = 1.0 - np.minimum(np.maximum(np.asarray(forget, dtype=float), 0.0), 1.0)
+    decay = kept * _decay(dt_s, time_s)
     return MarkovStep(decay, means, sigmas * markov_spread(decay))

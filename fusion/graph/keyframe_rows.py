@@ -9,12 +9,13 @@ from gtsam.symbol_shorthand import B, V, X
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph import gnss_factor, velocity_factor
-from terrafusion.fusion.graph.key_state import BIAS, IMU_ROTATION, NAV, POSE, VELOCITY, KeyState, skew
+from terrafusion.fusion.graph.key_state import BIAS, DIM, IMU_ROTATION, NAV, POSE, VELOCITY, KeyState, skew
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.wheel_factor import linearised
 
 SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
 WHEEL_ROWS = 4
+_PLACES = np.arange(DIM - NAV.stop)
 _IN_TIME_ORDER = np.r_[0:9, 18:24, 9:18, 24:31]
 """Columns of a `CombinedImuFactor`, keyframe by keyframe."""
 
@@ -81,7 +82,7 @@ def link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
     _fill_navigation(rows[:n], packed, before, node)
     if node.markov is not None:
         step, own = node.markov, rows[n : n + linear]
-        sigma, places = step.sigma[:linear], np.arange(linear)
+        sigma, places = step.sigma[:linear], _PLACES[:linear]
         own[places, 15 + places] = -step.decay[:linear] / sigma
         own[places, dim + 15 + places] = 1.0 / sigma
         own[:, 2 * dim] = -step.residual(before.point.linear, node.point.linear)[:linear] / sigma

@@ -95,12 +95,12 @@ def step(
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
     mean = [noise.slip_at(grade), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]
-    time_s = [slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S]
+    time_s = slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S
     out = markov_step(
         dt_s,
         mean=[*mean, *_NONE, noise.slip_per_grade],
         sigma=[*sigma, *_NONE, _surge_sigma(noise)],
-        time_s=[*time_s, *_FOREVER, SURGE_TIME_S],
+        time_s=(*time_s, *_FOREVER, SURGE_TIME_S),
         forget=[restarted, 0.0, 0.0, switch, 0.0, switch, *_NONE, switch],
     )
     out.sigma[_CONSTANT] = _WALK_SIGMA * math.sqrt(dt_s)

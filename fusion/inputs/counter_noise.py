@@ -32,13 +32,14 @@ class CounterNoise:
 
     def add(self, counted_m: float, integrated_m: float) -> None:
         """Mean increment of both sides, counted and by the speeds."""
+        counted, integrated = self._squares_m2
         if self._last_m is not None and (counted_m or self._last_m[0]):
             self._seen += 1
-            for i, (now, last) in enumerate(zip((counted_m, integrated_m), self._last_m, strict=True)):
-                bend_m = min(abs(now - last), MOST_M)
-                self._squares_m2[i] += (bend_m**2 - self._squares_m2[i]) / min(self._seen, MEMORY)
+            count, (last_counted_m, last_integrated_m) = min(self._seen, MEMORY), self._last_m
+            counted += (min(abs(counted_m - last_counted_m), MOST_M) ** 2 - counted) / count
+            integrated += (min(abs(integrated_m - last_integrated_m), MOST_M) ** 2 - integrated) / count
+            self._squares_m2 = [counted, integrated]
         self._last_m = counted_m, integrated_m
-        counted, integrated = self._squares_m2
         if self._seen >= MEMORY and counted > max(LEAST_M**2, RATIO**2 * integrated):
             self.out_of_step = True
 

@@ -5,6 +5,7 @@ goes on with the next. Numbers that no ground robot has are left out and counted
 no run.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ MOST_MPS, MOST_TRAVEL_M = 100.0, 1e9
 """Speed of a ground robot, and distance that a counter of its wheels may show."""
 MOST_AWAY_M, MOST_HEIGHT_M = 2e7, 1e5
 """Half the circumference of the earth; heights are below the stratosphere."""
+_FLOAT = np.dtype(float)
 LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
 """Reported sigmas outside this range are replaced by that of the class of fix; without a class the smaller
 ones are raised to it."""
@@ -73,6 +75,8 @@ def as_numbers(values: ArrayLike | None, what: str, channel: str) -> Array:
     Raises:
         DataError: they are no numbers.
     """
+    if type(values) is np.ndarray and values.dtype is _FLOAT:
+        return values
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -128,7 +132,7 @@ def checked_fix(
     known = _class_of(fix)
     if known is Fix.NONE:
         return None
-    if position.shape != (3,) or not np.isfinite(position[:2]).all():
+    if position.shape != (3,) or not math.isfinite(position[0] + position[1]):
         raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
     if beyond(position[:2], MOST_AWAY_M):
         raise DataError(
@@ -147,7 +151,7 @@ def checked_fix(
             f"a velocity of shape {velocity.shape}", channel="gnss", remedy="give east, north, up"
         )
     if velocity is not None:  # the estimator refuses and counts it; its square must not overflow
-        velocity = np.clip(velocity, -MOST_TRAVEL_M, MOST_TRAVEL_M)
+        velocity = np.minimum(np.maximum(velocity, -MOST_TRAVEL_M), MOST_TRAVEL_M)
     sigma_v_mps = as_number(sigma_v_mps, "velocity sigma", "gnss")
     if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
         sigma_v_mps = ASSUMED_VELOCITY_SIGMA_MPS
@@ -164,10 +168,11 @@ def _sigma_of(sigma_m: ArrayLike | None, known: Fix | None) -> Array | None:
             f"sigma {sigma.tolist()} is neither one number nor three", channel="gnss",
             remedy="give metres, 1 sigma, for east, north and up",
         )  # fmt: skip
-    sensible = ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
+    level = sigma[:2].tolist()
+    sensible = all(LEAST_CLAIM_M <= one <= MOST_CLAIM_M for one in level)
     if not sensible and known is not None:
         sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
-    elif not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
+    elif not all(0.0 < one < math.inf for one in level):
         raise DataError(
             f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
         )

@@ -115,7 +115,11 @@ class Leap:
         Raises:
             DataError: for seconds they have been ahead of fixes that go on as before.
         """
-        t_ns, before = sample[0], []
+        t_ns, before, newest = sample[0], [], self.newest
+        if not self.held and newest.t_ns is not None and t_ns - newest.t_ns <= LEAP_NS:  # as most are
+            self.refuted_ns = None
+            newest.advance(t_ns)
+            return [sample]
         if self.held and not self.newest.leaps(self.held[-1][0]):  # another stream has confirmed them
             before = self.held[:]
             self.held.clear()

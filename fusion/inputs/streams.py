@@ -107,8 +107,10 @@ class Lateness:
     def from_future(self, t_ns: int, times: list[int]) -> int:
         """How many of the newest samples, fewer than show a leap, have times that were wrong; before the
         start only."""
+        if self.used_ns is not None:
+            return 0
         ahead = len(times) - bisect.bisect_right(times, t_ns + LEAP_NS)
-        if self.used_ns is not None or not 0 < ahead < CONFIRMED:
+        if not 0 < ahead < CONFIRMED:
             return 0
         self.leap.dropped += ahead
         self.leap.newest.t_ns = t_ns
@@ -321,12 +323,14 @@ class WheelStream:
             DataError: it has no time, a number is missing, or the clock was set back.
         """
         t_ns = checked_time(t_ns, "wheels")
-        left_mps, right_mps = (as_number(v, "wheel speed", "wheels") for v in (left_mps, right_mps))
-        travel = (0.0 if m is None else as_number(m, "wheel travel", "wheels") for m in (left_m, right_m))
-        moved = *travel, left_mps, right_mps
-        if not all(math.isfinite(number) for number in moved):
+        left_mps = as_number(left_mps, "wheel speed", "wheels")
+        right_mps = as_number(right_mps, "wheel speed", "wheels")
+        left = 0.0 if left_m is None else as_number(left_m, "wheel travel", "wheels")
+        right = 0.0 if right_m is None else as_number(right_m, "wheel travel", "wheels")
+        moved = left, right, left_mps, right_mps
+        if not all(map(math.isfinite, moved)):
             raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
-        if max(abs(left_mps), abs(right_mps)) > MOST_MPS or max(abs(m) for m in moved) > MOST_TRAVEL_M:
+        if max(abs(left_mps), abs(right_mps)) > MOST_MPS or max(map(abs, moved)) > MOST_TRAVEL_M:
             self.impossible += 1
             return
         counted = None if left_m is None or right_m is None else moved[:2]
@@ -357,7 +361,7 @@ class WheelStream:
         """Counters of sample `i` without the jumps before it."""
         if counted is None:
             return None
-        left, right = (m + offset for m, offset in zip(counted, self._offset_m, strict=True))
+        left, right = counted[0] + self._offset_m[0], counted[1] + self._offset_m[1]
         before = self._counted[i - 1] if 0 < i == len(self.t_ns) - 1 else None
         if before is not None:
             most_m = JUMP_M + MOST_MPS * (self.t_ns[i] - self.t_ns[i - 1]) * 1e-9

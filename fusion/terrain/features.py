@@ -13,6 +13,8 @@ the spectrum over time at f is v/f^2 times a constant, so the RMS in a fixed ban
 factor is divided out, v being the faster of robot and wheels: wheels that spin on the spot shake, too.
 """
 
+import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +70,8 @@ class Window:
 
     def ground_speed_mps(self) -> float:
         """The faster of robot and wheels, m/s; 0 where both are unknown."""
-        return float(np.fmax(abs(np.nan_to_num(self.speed_mps)), abs(np.nan_to_num(self.wheel_speed_mps))))
+        known = [abs(v) for v in (self.speed_mps, self.wheel_speed_mps) if not math.isnan(v)]
+        return float(max(known, default=0.0))
 
 
 def extract(window: Window) -> tuple[Array, Array]:
@@ -159,10 +162,15 @@ def sample_rate_hz(t_s: Array) -> float | None:
 
 def periodogram(signals: Array, rate_hz: float) -> Array:
     """One-sided spectral density (n // 2 + 1, k) of signals (n, k), unit^2/Hz (Welch 1967, one segment)."""
-    n = len(signals)
-    line = np.arange(n) - (n - 1) / 2.0
+    line, taper = _line_and_taper(len(signals))
     slope = line @ signals / (line @ line)
-    taper = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n)
     detrended = (signals - signals.mean(axis=0) - line[:, None] * slope) * taper[:, None]
     spectrum = np.fft.rfft(detrended, axis=0)
     return np.asarray(2.0 * (spectrum.real**2 + spectrum.imag**2) / (rate_hz * (taper @ taper)))
+
+
+@functools.lru_cache(maxsize=16)
+def _line_and_taper(n: int) -> tuple[Array, Array]:
+    """Centred sample numbers and Hann taper (n,) of a window."""
+    line = np.arange(n) - (n - 1) / 2.0
+    return np.asarray(line), np.asarray(0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n))
