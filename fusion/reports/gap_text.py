@@ -64,10 +64,12 @@ def _screen(d: GapDiagnosis, out: Path | None, corrected: Path | None, most: int
 def verdict_line(d: GapDiagnosis) -> str:
     """The verdict in words, with its certainty."""
     verdict, sets = d.verdict, named_sets(d)
+    limited = d.drives is not None and d.drives.limits()
     if verdict.kind == "no_gap":
         if d.detection.p_value <= d.significance:
-            return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
-        if d.drives is not None and d.drives.limits():
+            other = "do the drives" if limited else "does the ground, which varies more along the path"
+            return f"Undecided: the runs differ from the references, and so {other} ({_test(d)})."
+        if d.drives is not None and limited:
             covered = f"which cover {percent(d.drives.covered)} of the time of these drives"
             return f"No gap as far as the references tell, {covered} ({_test(d)})."
         like = "the references among themselves" if d.references else "the twin's own runs"

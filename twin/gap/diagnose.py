@@ -34,8 +34,8 @@ from terrafusion.twin.model.vehicle import VehicleParams
 
 SIGNIFICANCE = 0.05
 STRICTER = 0.2
-"""On drives unlike the references', the p-value must be below such a share of the significance (assumed): how
-wrong laws are there is no more than assumed."""
+"""On drives unlike the references', or ground patchier than theirs, the p-value must be below such a share of
+the significance (assumed): how wrong laws are there is no more than assumed."""
 TOO_FEW = (
     "{} reference run(s) are too few, {} show how runs scatter: twin replicates stand in, and false alarms "
     "are as frequent as the twin is wrong (uncalibrated)"
@@ -132,8 +132,8 @@ def diagnose_evidence(
     drives = drive_coverage(runs, evidence.references, evidence.model)
     limited = drives is not None and drives.limits()
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
-    if limited:
-        verdict = verdict.where_drives_differ(detection.p_value <= STRICTER * significance)
+    if limited or evidence.patchier is not None:
+        verdict = verdict.where_references_fall_short(detection.p_value <= STRICTER * significance)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit)
     where = gap_map(evidence, sigma, offsets, seed)  # the misfit of laws would hide the place
     following = planner.next_run(verdict)

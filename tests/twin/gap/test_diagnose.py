@@ -26,7 +26,7 @@ from terrafusion.twin.gap.answer.next_run import (
 )
 from terrafusion.twin.gap.answer.verdict import UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.diagnose import diagnose
+from terrafusion.twin.gap.diagnose import diagnose, diagnose_evidence
 from terrafusion.twin.gap.infer.calibration import calibration_head
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null.score import score
@@ -211,7 +211,9 @@ def test_no_gap_on_a_clean_drive_that_no_reference_made(references: list[Recordi
     assert "Make these references" in said
 
 
-def test_undecided_where_drives_differ_and_nothing_explains_the_gap(references: list[Recording]) -> None:
+def test_undecided_where_drives_differ_and_nothing_explains_the_gap(
+    references: list[Recording],
+) -> None:
     found = diagnose([_swinging(run(i, drive=SLOW_TURNS)) for i in (610, 611)], references, VEHICLE)
     answer = checked(found)
     assert answer["gap"]["p_value"] <= 0.05
@@ -222,6 +224,17 @@ def test_undecided_where_drives_differ_and_nothing_explains_the_gap(references: 
     assert said.startswith("Undecided: the runs differ from the references, and so do the drives")
     assert "Your drives differ from your references" in said
     assert "turning -0.9 rad/s" in said
+
+
+def test_undecided_on_patchier_ground_where_the_test_is_not_sure(wide: GapDiagnosis) -> None:
+    """An effect that is clear stays one."""
+    patchier = dataclasses.replace(wide.evidence, patchier=2.0)
+    least = wide.detection.p_value
+    assert checked(diagnose_evidence(patchier, "elevate", significance=10.0 * least))["named"]
+    found = diagnose_evidence(patchier, "elevate", significance=2.0 * least)
+    answer = checked(found)
+    assert (answer["verdict"], answer["named"], answer["gap"]["detected"]) == ("no_gap", [], False)
+    assert "and so does the ground, which varies more" in " ".join(" ".join(screen(found)).split())
 
 
 def test_sets_and_drives_of_an_answer(wide: GapDiagnosis) -> None:

@@ -45,6 +45,8 @@ class GapEvidence:
         soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
         notes: assumptions, in sentences.
+        patchier: how many times as much the ground of the judged runs varies along the path as that of the
+            references; None where it does not.
         jobs: threads.
     """
 
@@ -59,6 +61,7 @@ class GapEvidence:
     soil_limit: Array
     cache: LinearisationCache
     notes: tuple[str, ...]
+    patchier: float | None = None
     jobs: int = 1
 
 
@@ -115,5 +118,5 @@ def gather_evidence(
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
         model, candidates, channels, noise, *clipped, every[:R], every[R:], limit, linearised,
-        tuple(dict.fromkeys(notes)), jobs,
+        tuple(dict.fromkeys(notes)), more, jobs,
     )  # fmt: skip

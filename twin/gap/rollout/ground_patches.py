@@ -12,7 +12,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import COARSE_STEP
+from terrafusion.twin.gap.data.samples import COARSE_STEP, Indices
 from terrafusion.twin.physics.layout import OUTPUTS
 
 PATCH_SIGMAS = {
@@ -30,7 +30,9 @@ _EAST, _NORTH = OUTPUTS.index("gnss_east_m"), OUTPUTS.index("gnss_north_m")
 _RATE, _SPEED = OUTPUTS.index("yaw_rate_radps"), OUTPUTS.index("speed_mps")
 
 
-def patch_columns(y: Array, by_effect: Array, counts: Array, candidates: Candidates, track_m: float) -> Array:
+def patch_columns(
+    y: Array, by_effect: Array, counts: Indices, candidates: Candidates, track_m: float
+) -> Array:
     """Derivatives (n, Y, D) of the outputs by independent changes of the ground in a window, of 1 sigma.
 
     Args:
