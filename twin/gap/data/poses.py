@@ -8,10 +8,10 @@ turns and shifts as a whole, so it is aligned with the fixes by a rigid transfor
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.calibrate.log import PreparedLog, window_of
+from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.gap.data.samples import Indices, sample_map
 
 EAST_NORTH = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
 """Channels of positions (rotated and shifted) and of velocities (rotated only)."""
@@ -26,10 +26,10 @@ def alignment_angles(log: PreparedLog, values: Sequence[Array]) -> Array:
     velocities together.
     """
     cross, dot = np.zeros(len(log.windows)), np.full(len(log.windows), HEADING_SIGMA_RAD**-2.0)
-    for shifts, observed, predicted, window, sigma in _tracks(log, values):
-        for k in range(len(log.windows)):
-            a, b = predicted[window == k], observed[window == k]
-            if shifts and len(a):
+    for shifts, observed, predicted, windows, sigma in _tracks(log, values):
+        for k, rows in windows:
+            a, b = predicted[rows], observed[rows]
+            if shifts:
                 a, b = a - a.mean(axis=0), b - b.mean(axis=0)
             cross[k] += float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) / sigma**2
             dot[k] += float(np.sum(a * b)) / sigma**2
@@ -40,13 +40,12 @@ def aligned(log: PreparedLog, values: Sequence[Array]) -> list[Array]:
     """Predicted channels with the track of each window aligned with the observed one."""
     out, angles = list(values), alignment_angles(log, values)
     index = {o.channel: i for i, o in enumerate(log.observed)}
-    for shifts, observed, predicted, window, _ in _tracks(log, values):
+    for shifts, observed, predicted, windows, _ in _tracks(log, values):
         turned = np.empty_like(predicted)
-        for k, angle in enumerate(angles):
-            mine = window == k
-            turned[mine] = predicted[mine] @ _rotation(angle).T
-            if shifts and mine.any():
-                turned[mine] += (observed[mine] - turned[mine]).mean(axis=0)
+        for k, rows in windows:
+            turned[rows] = predicted[rows] @ _rotation(angles[k]).T
+            if shifts:
+                turned[rows] += (observed[rows] - turned[rows]).mean(axis=0)
         for column, channel in enumerate(EAST_NORTH[0 if shifts else 1]):
             out[index[channel]] = turned[:, column]
     return out
@@ -56,10 +55,10 @@ def aligned_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Ar
     """Poses (W, 3) at the windows' starts that align the predictions, made from the poses `start`."""
     out, angles = start.copy(), alignment_angles(log, values)
     out[:, 2] += angles
-    for shifts, observed, predicted, window, _ in _tracks(log, values):
-        for k in np.unique(window) if shifts else ():
-            middle = predicted[window == k].mean(axis=0)
-            out[k, :2] = observed[window == k].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
+    for shifts, observed, predicted, windows, _ in _tracks(log, values):
+        for k, rows in windows if shifts else ():
+            middle = predicted[rows].mean(axis=0)
+            out[k, :2] = observed[rows].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
     return out
 
 
@@ -69,9 +68,9 @@ def _rotation(angle: float) -> Array:
 
 def _tracks(
     log: PreparedLog, values: Sequence[Array]
-) -> list[tuple[bool, Array, Array, NDArray[np.int64], float]]:
+) -> list[tuple[bool, Array, Array, list[tuple[int, Indices]], float]]:
     """Of positions and velocities that the log has: whether they shift, observed and predicted values (n, 2),
-    window of each sample, sigma."""
+    windows with their samples, sigma."""
     index = {o.channel: i for i, o in enumerate(log.observed)}
     out = []
     for pair in EAST_NORTH:
@@ -81,6 +80,6 @@ def _tracks(
         first = log.observed[both[0]]
         observed = np.stack([log.observed[i].value for i in both], axis=1)
         predicted = np.stack([values[i] for i in both], axis=1)
-        window = window_of(first, log.windows)
-        out.append((pair == EAST_NORTH[0], observed, predicted, window, float(np.median(first.sigma))))
+        windows = [(k, rows) for i, k, rows in sample_map(log).blocks if i == both[0]]
+        out.append((pair == EAST_NORTH[0], observed, predicted, windows, float(np.median(first.sigma))))
     return out
