@@ -68,7 +68,7 @@ TARGETS = {
         "tests/fusion/outputs/test_learned_numbers.py",
     ),
     "fusion/inputs/door.py": ("tests/fusion/inputs/test_door.py",),
-    "fusion/inputs/leaps.py": ("tests/fusion/inputs/test_leaps.py", "tests/fusion/inputs/test_door.py"),
+    "fusion/inputs/leaps.py": ("tests/fusion/inputs/test_leaps.py",),
     "fusion/inputs/gyro_unit.py": ("tests/fusion/inputs/test_gyro_unit.py",),
     "twin/gap/infer/single_effects.py": ("tests/twin/gap/infer/test_single_effects.py",),
     "twin/gap/infer/predictive.py": ("tests/twin/gap/infer/test_predictive.py",),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.calibration import online
 from terrafusion.fusion.calibration.motion import Drive
 from terrafusion.fusion.calibration.numbers import GNSS_DELAY, NUMBERS, Knowledge
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
@@ -15,7 +18,12 @@ from terrafusion.twin.simulate import simulate
 from tests.fusion.calibration.test_fit import NOISE, PRIOR, STEP_S, TRUE, figure
 
 
-def driven(drive: Drive, learning: SelfCalibration, begin_ns: int = 0) -> list[Knowledge]:
+def driven(
+    drive: Drive,
+    learning: SelfCalibration,
+    begin_ns: int = 0,
+    until: Callable[[], bool] = lambda: False,
+) -> list[Knowledge]:
     """Gives a drive sample by sample; what was known after each step."""
     known, j, z, yaw = [], 0, 0j, 0.0
     for i, t_s in enumerate(drive.t_s):
@@ -31,6 +39,8 @@ def driven(drive: Drive, learning: SelfCalibration, begin_ns: int = 0) -> list[K
             j += 1
         if learning.advance():
             known.append(learning.known)
+        if until():
+            break
     return known
 
 
@@ -119,3 +129,102 @@ def test_an_estimator_restored_within_a_step_learns_the_same() -> None:
     assert again.learned.calibration is not None
     assert same(again.learned.calibration.known.mean, learning.known.mean)
     assert not same(learning.known.mean, learning.prior.mean)
+
+
+def begun() -> SelfCalibration:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    learning.drive(10**9, 0.0, 0.0, np.zeros(2), 0.0)
+    return learning
+
+
+def test_fixes_closer_than_their_errors_last_are_left_out() -> None:
+    learning = begun()
+    for t_ms in (500, 1000, 1100, 1549, 1550, 1990, 2010):
+        learning.fix(t_ms * 10**6, np.array([float(t_ms), 2.0, 3.0]), 0.1 * t_ms)
+    assert [(round(t_s, 3), east, north) for t_s, east, north, _ in learning._fixes] == [
+        (0.1, 1100.0, 2.0),
+        (0.55, 1550.0, 2.0),
+        (1.01, 2010.0, 2.0),
+    ]
+    assert learning.usual_sigma_m == pytest.approx(155.0)  # the median
+
+
+def test_before_the_first_sample_a_fix_has_no_time() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    learning.fix(10**9, np.zeros(3), 0.1)
+    learning.restart()
+    assert (learning._fixes, learning.usual_sigma_m) == ([], 0.0)
+
+
+def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior() -> None:
+    """The place of the antenna along x is given to a millimetre: no drive tells it better."""
+    covariance = PRIOR.covariance.copy()
+    covariance[3, 3] = 1e-6
+    given = dataclasses.replace(PRIOR, covariance=covariance)
+    learning = SelfCalibration(given, NOISE, 0j)
+    assert learning.gnss_delay_s == PRIOR.mean[GNSS_DELAY]
+    ended = driven(figure(300.0, fix_sigma_m=0.05), learning, until=lambda: learning.before is not given)
+    known, begin = ended[-1], learning.before
+    wider, prior = known.covariance * online.FORGOTTEN, np.diag(covariance)
+    assert (np.diag(wider) > prior).tolist() == [i == 3 for i in range(len(prior))]
+    assert np.diag(begin.covariance) == pytest.approx(np.minimum(np.diag(wider), prior), rel=1e-9)
+    correlations = [c / np.sqrt(np.outer(np.diag(c), np.diag(c))) for c in (wider, begin.covariance)]
+    assert np.allclose(*correlations, atol=1e-9)
+    assert same(begin.mean, known.mean)
+    assert learning.gnss_delay_s == known.mean[GNSS_DELAY] != PRIOR.mean[GNSS_DELAY]
+
+
+def step_times(drive: Drive) -> tuple[list[float], list[int]]:
+    """When steps begin, and how many nodes there are then."""
+    learning, times_s, nodes = SelfCalibration(PRIOR, NOISE, 0j), list[float](), list[int]()
+
+    def look() -> bool:
+        if learning._stepped_s != (times_s[-1] if times_s else 0.0):
+            times_s.append(learning._stepped_s)
+            nodes.append(len(learning._first))
+        return False
+
+    driven(drive, learning, until=look)
+    return times_s, nodes
+
+
+def test_a_step_waits_for_four_nodes_four_fixes_and_four_seconds() -> None:
+    """Of a robot whose numbers are as assumed: no step is far off, so that the next one waits."""
+    drive = figure(60.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    times_s, nodes = step_times(drive)
+    assert times_s[0] >= online.STEP_S
+    assert nodes[0] == 4, "at once"
+    assert np.diff(times_s) == pytest.approx(online.STEP_S, abs=0.11)
+    late = dataclasses.replace(
+        drive, fix_t_s=drive.fix_t_s[12:], fix=drive.fix[12:], fix_sigma_m=drive.fix_sigma_m[12:]
+    )
+    first = step_times(late)[0][0]
+    assert drive.fix_t_s[15] <= first < drive.fix_t_s[15] + 0.25, "the fourth fix has come"
+
+
+def test_a_robot_that_stands_makes_a_step_only_with_a_new_node() -> None:
+    drive = figure(120.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    still = drive.t_s[:-1] >= 40.0
+    stopped = dataclasses.replace(
+        drive,
+        distance_m=np.where(still, 0.0, drive.distance_m),
+        turn_rad=np.where(still, 0.0, drive.turn_rad),
+        fix=np.where(drive.fix_t_s >= 40.0, drive.fix[drive.fix_t_s < 40.0][-1], drive.fix),
+    )
+    times_s, nodes = (np.array(one) for one in step_times(stopped))
+    late = nodes[times_s > 41.0]
+    resting = late[late > late[0]]  # since the first node at rest
+    assert len(resting) >= 2
+    assert (np.diff(resting) > 0).all()
+
+
+def test_a_new_stretch_begins_from_what_is_known_or_is_given() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    driven(figure(60.0, fix_sigma_m=0.05), learning)
+    known = learning.known
+    learning.restart()
+    assert learning.before is learning.known is known
+    learning.restart(PRIOR)
+    assert learning.before is learning.known is PRIOR
+    learning.start_from(known)
+    assert learning.prior is learning.before is learning.known is known
