@@ -228,3 +228,33 @@ def test_a_new_stretch_begins_from_what_is_known_or_is_given() -> None:
     assert learning.before is learning.known is PRIOR
     learning.start_from(known)
     assert learning.prior is learning.before is learning.known is known
+
+
+def test_fixes_that_no_numbers_explain_do_not_hurry_the_steps() -> None:
+    drive = figure(60.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    scatter = np.random.default_rng(0).normal(size=(2, len(drive.fix))) * 3.0
+    times_s, _ = step_times(dataclasses.replace(drive, fix=drive.fix + scatter[0] + 1j * scatter[1]))
+    assert np.diff(times_s)[2:] == pytest.approx(online.STEP_S, abs=0.11)
+
+
+def test_new_nodes_begin_where_the_wheels_have_led() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    drive = figure(90.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    driven(drive, learning)
+    nodes = learning._nodes()
+    assert len(nodes.state) > len(learning._state)
+    chords = np.hypot(*np.diff(nodes.state[:, :2], axis=0).T)
+    rolled = np.concatenate([[0.0], np.cumsum(drive.distance_m)])
+    arcs = np.diff(rolled[np.array(learning._first)])
+    assert (chords < 1.02 * arcs + 0.05).all()
+    assert (chords > 0.85 * arcs - 0.05).all()
+
+
+def test_before_a_drive_nothing_is_begun_anew() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    drive = learning._drive
+    learning.restart()
+    assert learning._drive is drive
+    learning.drive(10**9, 0.0, 0.0, np.zeros(2), 0.0)
+    learning.restart()
+    assert learning._drive is not drive

@@ -98,6 +98,7 @@ def test_the_next_sample_is_used_at_once() -> None:
     for t_ns in (NOW + 100 * MS, NOW + 100 * MS + S, NOW - S):
         assert leap.admitted((t_ns, "imu")) == [(t_ns, "imu")]
     assert (leap.newest.t_ns, leap.held, leap.dropped) == (NOW + 100 * MS + S, [], 0)
+    assert Leap(Newest()).admitted((NOW,)) == [(NOW,)]
 
 
 @pytest.mark.parametrize(("step_ns", "needed"), [(100 * MS, 6), (250 * MS, 3), (400 * MS, 3), (50 * MS, 11)])
