@@ -185,9 +185,9 @@ def test_fixes_that_contradict_for_five_seconds_are_an_error() -> None:
         assert leap.admitted((NOW + 60 * S + k * 100 * MS,)) == []
     assert leap.refuted_ns == NOW + 60 * S + 100 * MS
     dropped = leap.dropped
-    leap.newest.fix(NOW + 5200 * MS)
+    leap.newest.fix(NOW + 5100 * MS + 1)
     with pytest.raises(DataError, match=r"60\.0 s ahead of the fixes, which go on as before"):
-        leap.admitted((NOW + 65200 * MS,))
+        leap.admitted((NOW + 65100 * MS + 1,))
     assert leap.dropped == dropped + 2  # the one that was held, and this one
 
 
