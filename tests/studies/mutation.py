@@ -59,7 +59,7 @@ TARGETS = {
         f"{MODES}test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot",
     ),
     "fusion/calibration/online.py": ("tests/fusion/calibration/test_online.py",),
-    "fusion/estimator/skid.py": ("tests/fusion/estimator/test_skid.py",),
+    "fusion/estimator/skid.py": ("tests/fusion/estimator/test_skid_rules.py",),
     "datasets/checks/delays.py": ("tests/datasets/checks/test_timing.py",),
     "datasets/checks/scale.py": ("tests/datasets/checks/test_physical_faults.py",),
     "fusion/calibration/slip.py": ("tests/fusion/calibration/test_slip.py",),
