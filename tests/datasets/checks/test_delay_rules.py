@@ -1,0 +1,200 @@
+"""What is made of a measured delay between sensors: thresholds, words, repairs, and look-alikes."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import delays
+from terrafusion.datasets.checks.bootstrap_interval import BootstrapInterval
+from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.motion import Signal
+from terrafusion.datasets.checks.sensor_pairs import Pair
+from terrafusion.datasets.core.lag import Lag
+from terrafusion.datasets.core.recording import Recording
+from tests.datasets.conftest import make_drive
+
+IMU: Pair = ("imu", "wheels")
+TRUTH: Pair = ("truth", "imu")
+GNSS: Pair = ("gnss", "wheels")
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return make_drive()
+
+
+def wave(period_s: float = 0.02, late_s: float = 0.0, seconds: float = 60.0) -> Signal:
+    """A lively signal; `late_s` behind the others."""
+    t_s = np.arange(0.0, seconds, period_s)
+    at = t_s - late_s
+    values = np.sin(1.1 * at) + np.sin(0.37 * at) + 0.5 * np.sin(2.9 * at)
+    return np.rint(t_s * 1e9).astype(np.int64), values
+
+
+def test_an_interval_that_holds_zero_is_no_distance_from_it() -> None:
+    assert delays._distance_to_zero_s(Lag(0.3, 0.1, 0.5, 1.0)) == 0.1
+    assert delays._distance_to_zero_s(Lag(-0.3, -0.5, -0.1, 1.0)) == 0.1
+    assert delays._distance_to_zero_s(Lag(0.3, -0.1, 0.5, 1.0)) == 0.0
+    assert delays._distance_to_zero_s(Lag(0.3, 0.0, 0.5, 1.0)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("pair", "seconds", "low_s", "high_s", "period_s", "matters"),
+    [
+        (IMU, 0.1, 0.06, 0.14, 0.01, True), (IMU, 0.099, 0.06, 0.14, 0.01, False),
+        (IMU, 0.1, 0.05, 0.15, 0.01, False), (IMU, -0.15, -0.19, -0.101, 0.01, True),
+        (IMU, -0.15, -0.19, -0.099, 0.01, False), (TRUTH, -0.15, -0.19, -0.06, 0.01, True),
+        (GNSS, 0.2, 0.11, 0.3, 0.2, True), (GNSS, 0.19, 0.15, 0.2, 0.2, False),
+        (GNSS, 0.6, 0.49, 0.7, 1.0, False), (GNSS, 0.6, 0.51, 0.7, 1.0, True),
+    ],
+)  # fmt: skip
+def test_which_lags_matter(
+    pair: Pair, seconds: float, low_s: float, high_s: float, period_s: float, matters: bool
+) -> None:
+    """Half a sample, or half of the least lag, are no lag; behind wheels a whole one."""
+    lag = Lag(seconds, low_s, high_s, 0.9)
+    assert delays._matters(pair, lag, wave(period_s), wave(0.01)) == matters
+    assert delays._matters(pair, lag, wave(0.01), wave(period_s)) == matters
+
+
+@pytest.mark.parametrize(
+    ("off", "channel", "severity", "words"),
+    [
+        ({IMU: Lag(0.4, 0.3, 0.49, 0.9)}, "wheels", "warning", "0.400 s late against imu"),
+        ({IMU: Lag(0.6, 0.51, 0.7, 0.9)}, "wheels", "error", "0.600 s late against imu"),
+        ({IMU: Lag(0.6, 0.5, 0.7, 0.9)}, "wheels", "warning", "0.600 s late against imu"),
+        ({IMU: Lag(-1.9, -2.0, -1.8, 0.9)}, "wheels", "warning", "1.900 s early against imu"),
+        ({IMU: Lag(-2.2, -2.3, -2.01, 0.9)}, "wheels", "error", "2.200 s early against imu"),
+        ({GNSS: Lag(0.4, 0.3, 0.5, 0.9)}, "gnss", "warning", "0.400 s early against wheels"),
+        ({GNSS: Lag(-2.9, -3.2, -2.8, 0.9)}, "gnss", "warning", "2.900 s late against wheels"),
+        ({GNSS: Lag(3.2, 3.01, 3.3, 0.9)}, "gnss", "error", "3.200 s early against wheels"),
+    ],
+)
+def test_words_and_repair_of_an_offset(
+    drive: Recording, off: dict[Pair, Lag], channel: str, severity: str, words: str
+) -> None:
+    finding = delays.offset_finding(drive, off, set(off))
+    assert (finding.code, finding.severity, finding.channel) == ("clock-offset", severity, channel)
+    assert finding.what == f"its times are {words}"
+    late_s = float(words.split()[0]) * (1.0 if "late" in words else -1.0)
+    assert finding.fix.startswith(f"move the times of {channel} by {-late_s:+.3f} s")
+    (lag,) = off.values()
+    first, last = (lag.low_s, lag.high_s) if channel == "wheels" else (-lag.high_s, -lag.low_s)
+    assert f"interval {first:.3f} to {last:.3f} s, correlation 0.90" in finding.evidence
+    assert finding.repair is not None
+    moved, before = getattr(finding.repair(drive), channel), getattr(drive, channel)
+    np.testing.assert_array_equal(moved.t_ns, before.t_ns - round(late_s * 1e9))
+
+
+def test_of_several_the_sharpest_lag_is_told(drive: Recording) -> None:
+    off = {IMU: Lag(0.4, 0.3, 0.5, 0.9), ("truth", "wheels"): Lag(0.42, 0.4, 0.44, 0.8)}
+    finding = delays.offset_finding(drive, off, {*off, TRUTH})
+    assert finding.what == "its times are 0.420 s late against truth"
+    assert "disagrees with imu and truth" in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "words"),
+    [
+        (0.5, 0.21, 0.8, "0.50 s late"), (0.5, 0.19, 0.8, ""), (0.29, 0.25, 0.3, ""),
+        (0.31, 0.25, 0.4, "0.31 s late"), (-0.5, -0.8, -0.3, "0.50 s early"), (-0.5, -0.8, -0.1, ""),
+    ],
+)  # fmt: skip
+def test_late_fixes(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, value: float, low: float, high: float, words: str
+) -> None:
+    model = SimpleNamespace(delay_s=BootstrapInterval(value, low, high), windows=17)
+    monkeypatch.setattr(delays, "path_by", lambda *_: object())
+    monkeypatch.setattr(delays, "path_model", lambda *_: model)
+    found = list(delays._late_fixes(CheckContext(drive, None)))
+    assert [finding.what for finding in found] == (
+        [f"its times are {words} against wheels and imu"] if words else []
+    )
+    if words:
+        assert found[0].evidence.endswith(f"{low:.2f} to {high:.2f} s, by the path in 17 stretches")
+        assert found[0].fix == f"move the times of gnss by {-value:+.2f} s"
+        assert found[0].repair is not None
+        moved = found[0].repair(drive).gnss
+        assert moved is not None
+        assert drive.gnss is not None
+        np.testing.assert_array_equal(moved.t_ns, drive.gnss.t_ns - round(value * 1e9))
+    monkeypatch.setattr(delays, "path_by", lambda *_: None)
+    assert not list(delays._late_fixes(CheckContext(drive, None)))
+
+
+def test_delays_that_the_vehicle_file_has_are_taken_out_first(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = CheckContext(drive, None)
+    assert delays._on_one_clock(context) is context
+    known = {"gnss_delay_s": 0.2, "wheel_delay_s": -0.1}
+    monkeypatch.setattr(CheckContext, "known", lambda self, name: known[name])
+    corrected = delays._on_one_clock(context).recording
+    for name, late_ns in (("gnss", 200_000_000), ("wheels", -100_000_000), ("imu", 0)):
+        np.testing.assert_array_equal(getattr(corrected, name).t_ns, getattr(drive, name).t_ns - late_ns)
+
+
+def test_a_mean_of_the_last_samples_is_no_clock() -> None:
+    """Over 0.6 s: 0.29 s late. A plain delay stays what it is."""
+    t_ns, values = wave()
+    mean = np.convolve(values, np.full(30, 1.0 / 30.0))[: len(values)]
+    lag = Lag(0.29, 0.28, 0.3, 0.98)
+    found = delays._without_smoothing(lag, wave(), (t_ns, mean))
+    assert found.seconds == pytest.approx(0.0, abs=0.041)  # lengths are tried in steps of 0.08 s
+    assert found.high_s - found.low_s == pytest.approx(0.02)
+    assert found.high_s == pytest.approx(found.seconds + 0.01)
+    late = Lag(0.3, 0.29, 0.31, 1.0)
+    assert delays._without_smoothing(late, wave(), wave(late_s=0.3)) == late
+
+
+def test_a_body_that_is_dragged_follows_and_a_late_clock_does_not() -> None:
+    from scipy.signal import lfilter
+
+    t_ns, values = wave()
+    decay = float(np.exp(-0.02 / 0.5))
+    dragged = (t_ns, lfilter([1.0 - decay], [1.0, -decay], values))
+    lag = Lag(-0.4, -0.42, -0.38, 0.95)
+    assert delays._follows(lag, dragged, wave())
+    assert not delays._follows(lag, wave(late_s=0.4), wave())
+
+
+def test_a_wrong_sign_is_no_clock() -> None:
+    t_ns, values = wave()
+    lag = Lag(0.4, 0.38, 0.42, 0.9)
+    assert delays.opposed(lag, wave(), (t_ns, -values))
+    assert not delays.opposed(lag, wave(), wave(late_s=0.4))
+    short = wave(seconds=0.02)
+    assert not delays.opposed(lag, short, short)
+
+
+def test_between_gaps_a_signal_is_not_known() -> None:
+    t_ns, values = wave()
+    keep = (t_ns < 10 * 10**9) | (t_ns >= 12 * 10**9)
+    values = values.copy()
+    values[100] = np.nan
+    grid = np.arange(0.0, 20.0, 0.02)
+    found, known = delays._resampled(grid, (t_ns[keep], values[keep]), t_ns[0])
+    assert not known[(grid > 10.0) & (grid < 11.9)].any()
+    assert known[grid < 9.9].all(), "one empty cell is bridged"
+    assert found[known] == pytest.approx(wave()[1][: len(grid)][known], abs=0.01)
+    grid, start = delays._common_grid((t_ns, values), (t_ns[50:500], values[50:500]))
+    assert (int(start), grid[0], len(grid)) == (int(t_ns[50]), 0.0, 449)
+    assert grid[1] == delays.GRID_S
+
+
+def test_correlations_of_nothing_are_none() -> None:
+    one = wave()[1]
+    assert delays._correlation(one, 2.0 * one + 1.0) == pytest.approx(1.0)
+    assert delays._correlation(one, -one) == pytest.approx(-1.0)
+    assert delays._correlation(one[:0], one[:0]) == 0.0
+    assert delays._correlation(one, np.zeros(len(one))) == 0.0
+    assert delays._correlation(np.ones(len(one)), one) == 0.0
+
+
+def test_a_context_without_known_delays_keeps_its_recording(drive: Recording) -> None:
+    other = dataclasses.replace(drive, gnss=None)
+    assert delays._on_one_clock(CheckContext(other, None)).recording is other

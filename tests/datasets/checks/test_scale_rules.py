@@ -1,0 +1,280 @@
+"""What is made of a measured scale of wheels or gyro: thresholds, words and repairs."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import scale
+from terrafusion.datasets.checks.bootstrap_interval import BootstrapInterval
+from terrafusion.datasets.checks.finding import CheckContext, Finding
+from terrafusion.datasets.checks.path import PathScale
+from terrafusion.datasets.core.recording import Overrides, Recording
+from tests.datasets.conftest import RADIUS_M, make_drive
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    """Clean, on grass; its wheels are in rad/s."""
+    found = make_drive()
+    return dataclasses.replace(found, overrides=Overrides(wheel_radius_m=RADIUS_M), terrain_name="grass")
+
+
+def judged(
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    ratio: float,
+    half: float = 0.001,
+    *,
+    spread: float = 0.5,
+    source: str = "gnss",
+    wheel_scale: float = 0.0,
+) -> list[Finding]:
+    """Findings where the ground speed is `ratio` times the wheels', to within `half`."""
+    fits = SimpleNamespace(scale=ratio * np.array([1.0 - spread, 1.0, 1.0 + spread]))
+    wide = PathScale(3.0, 0.1, 9.0, 5, "truth"), fits
+    found = PathScale(ratio, ratio - half, ratio + half, 12, source), fits
+    monkeypatch.setattr(scale, "scales", lambda _: [wide, found])
+    monkeypatch.setattr(CheckContext, "known", lambda self, name: wheel_scale)
+    return list(scale.check_speed_scale(CheckContext(recording, None)))
+
+
+def codes(findings: list[Finding]) -> list[str]:
+    return [finding.code for finding in findings]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "half", "wheel_scale", "found"),
+    [
+        (1.0, 0.001, 0.0, []), (1.039, 0.001, 0.0, []), (1.041, 0.001, 0.0, ["wheel-radius"]),
+        (1.041, 0.022, 0.0, []), (1.041, 0.02, 0.0, ["wheel-radius"]), (1.09, 0.001, 0.05, []),
+        (1.093, 0.001, 0.05, ["wheel-radius"]), (0.801, 0.15, 0.0, []), (0.799, 0.15, 0.0, ["wheel-scale"]),
+        (0.93, 0.009, 0.0, ["wheel-scale"]), (0.93, 0.011, 0.0, []), (0.98, 0.001, 0.05, ["wheel-scale"]),
+        (0.99, 0.001, 0.05, []),
+    ],
+)  # fmt: skip
+def test_from_which_ratio_on(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, ratio: float, half: float, wheel_scale: float,
+    found: list[str],
+) -> None:  # fmt: skip
+    assert codes(judged(drive, monkeypatch, ratio, half, wheel_scale=wheel_scale)) == found
+
+
+def test_the_narrower_interval_counts_and_its_source_is_named(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (finding,) = judged(drive, monkeypatch, 1.1, source="truth")
+    assert finding.evidence == (
+        "1.099 to 1.101 (95 %) in 12 stretches by the truth; scores against this truth are then not "
+        "independent of it"
+    )
+    (finding,) = judged(drive, monkeypatch, 1.1)
+    assert finding.evidence == "1.099 to 1.101 (95 %) in 12 stretches by the gnss"
+
+
+def test_a_larger_wheel_is_repaired_by_its_radius_or_the_speeds(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (finding,) = judged(drive, monkeypatch, 1.1)
+    assert f"a wheel radius of {1.1 * RADIUS_M:.4f} m instead of {RADIUS_M:.4f} m" in finding.fix
+    assert finding.what.startswith("ground speed is 1.100 times the wheel speed")
+    assert finding.repair is not None
+    assert finding.repair(drive).overrides.wheel_radius_m == pytest.approx(1.1 * RADIUS_M)
+    assert drive.wheels is not None
+    metres = dataclasses.replace(
+        drive, wheels=dataclasses.replace(drive.wheels, unit="mps", speed=drive.wheels.speed * RADIUS_M)
+    )
+    (finding,) = judged(metres, monkeypatch, 1.1)
+    assert finding.fix == "multiply the speeds by 1.100"
+    assert finding.repair is not None
+    repaired = finding.repair(metres).wheels
+    assert repaired is not None
+    assert repaired.speed == pytest.approx(1.1 * drive.wheels.speed * RADIUS_M)
+
+
+@pytest.mark.parametrize(("ratio", "repaired"), [(2.19, True), (2.21, False)])
+def test_beyond_twice_the_radius_nothing_is_repaired(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, ratio: float, repaired: bool
+) -> None:
+    silent = dataclasses.replace(drive, command=None)
+    (finding,) = judged(silent, monkeypatch, ratio)
+    assert (finding.repair is not None) == repaired
+    assert ("check wheel radius and unit" in finding.fix) != repaired
+
+
+def sloping(drive: Recording, descent: float) -> Recording:
+    """Straight for 100 m, down by a share of it."""
+    gnss = drive.gnss
+    assert gnss is not None
+    way = np.linspace(0.0, 100.0, len(gnss))
+    enu = np.stack([0.6 * way, 0.8 * way, 7.0 - descent * way], axis=1)
+    enu[3] = np.nan
+    return dataclasses.replace(drive, gnss=dataclasses.replace(gnss, enu_m=enu))
+
+
+@pytest.mark.parametrize(("descent", "repaired"), [(0.04, True), (0.06, False), (-0.2, True)])
+def test_downhill_wheels_may_be_braked(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, descent: float, repaired: bool
+) -> None:
+    (finding,) = judged(sloping(drive, descent), monkeypatch, 1.1)
+    assert (finding.repair is not None) == repaired
+    assert ("downhill on braked wheels" in finding.fix) != repaired
+
+
+def test_a_descent_needs_fixes_that_lie_apart(drive: Recording) -> None:
+    assert scale._descent(sloping(drive, 0.1)) == pytest.approx(0.1)
+    assert scale._descent(dataclasses.replace(drive, gnss=None)) == 0.0
+    assert drive.gnss is not None
+    for count in (0, 1):
+        few = dataclasses.replace(drive, gnss=drive.gnss.select(np.arange(len(drive.gnss)) < count))
+        assert scale._descent(few) == 0.0
+    near = sloping(drive, 0.5)
+    assert near.gnss is not None
+    enu = near.gnss.enu_m * 0.009
+    assert scale._descent(dataclasses.replace(near, gnss=dataclasses.replace(near.gnss, enu_m=enu))) == 0.0
+
+
+def test_soft_ground_explains_slip(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert codes(judged(drive, monkeypatch, 0.7)) == ["wheel-scale"]
+    (finding,) = judged(drive, monkeypatch, 0.7)
+    assert finding.what == "the wheels read 42.9% too much: ground speed is 0.700 times the wheel speed"
+    assert f"({0.7 * RADIUS_M:.4f} m fits)" in finding.fix
+    for soft in ("mud", "loose_sand", "ice"):
+        assert not judged(dataclasses.replace(drive, terrain_name=soft), monkeypatch, 0.7)
+    assert drive.terrain is not None
+    for last, found in (("asphalt", 1), ("mud", 0)):
+        label = np.array(["asphalt"] * (len(drive.terrain) - 1) + [last], dtype=object)
+        terrain = dataclasses.replace(drive.terrain, label=label)
+        labelled = dataclasses.replace(drive, terrain_name=None, terrain=terrain)
+        assert len(judged(labelled, monkeypatch, 0.7)) == found
+
+
+@pytest.mark.parametrize(
+    ("ratio", "name", "factor"),
+    [
+        (2.0 * np.pi / 60.0, "rev/min", 2.0 * np.pi / 60.0), (np.pi / 180.0, "deg/s", np.pi / 180.0),
+        (2.0 * np.pi, "rev/s or m/s", None),
+    ],
+)  # fmt: skip
+def test_units_that_explain_the_ratio(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, ratio: float, name: str, factor: float | None
+) -> None:
+    """Of wheels that are fast and even; without a command."""
+    assert drive.wheels is not None
+    fast = dataclasses.replace(drive.wheels, speed=drive.wheels.speed / ratio * 5.0)
+    silent = dataclasses.replace(drive, wheels=fast, command=None)
+    (finding,) = judged(silent, monkeypatch, ratio, spread=0.05)
+    assert finding.code == "wheel-unit"
+    assert f"look like {name}:" in finding.what
+    if factor is None:
+        assert finding.repair is None
+        assert finding.fix == "give the unit: more than one fits"
+    else:
+        assert finding.repair is not None
+        repaired = finding.repair(silent).wheels
+        assert repaired is not None
+        assert repaired.speed == pytest.approx(factor * fast.speed)
+    if ratio < 1.0:
+        assert codes(judged(silent, monkeypatch, ratio, spread=0.2)) == ["wheel-scale"], "uneven"
+        assert codes(judged(silent, monkeypatch, 0.85 * ratio, spread=0.05)) == ["wheel-scale"], "no unit"
+        slow = dataclasses.replace(silent, wheels=dataclasses.replace(fast, speed=fast.speed * 1e-3))
+        assert codes(judged(slow, monkeypatch, ratio, spread=0.05)) == ["wheel-scale"], "a usual speed"
+
+
+def test_a_command_decides_between_units(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert scale.command_ratio(CheckContext(drive, None)) == pytest.approx(1.0, abs=0.05)
+    assert drive.wheels is not None
+    for factor in (2.0 * np.pi / 60.0, 2.0 * np.pi):
+        other = dataclasses.replace(
+            drive, wheels=dataclasses.replace(drive.wheels, speed=drive.wheels.speed / factor)
+        )
+        context = CheckContext(other, None)
+        assert scale.command_ratio(context) == pytest.approx(factor, rel=0.05)
+        assert codes(judged(other, monkeypatch, factor)) == ["wheel-unit"]
+        assert codes(judged(other, monkeypatch, factor * 1.09)) == ["wheel-unit"]
+        assert codes(judged(other, monkeypatch, factor * 1.12)) != ["wheel-unit"]
+    assert codes(judged(drive, monkeypatch, 2.0 * np.pi / 60.0)) == ["wheel-scale"], "the command agrees"
+
+
+def test_a_command_that_the_wheels_do_not_follow_says_nothing(drive: Recording) -> None:
+    assert drive.command is not None
+    for v_mps in (
+        np.full(len(drive.command), np.nan),
+        np.zeros(len(drive.command)),
+        np.where(np.arange(len(drive.command)) < 9, 1.0, np.nan),
+        np.random.default_rng(0).normal(size=len(drive.command)),
+    ):
+        other = dataclasses.replace(drive, command=dataclasses.replace(drive.command, v_mps=v_mps))
+        assert scale.command_ratio(CheckContext(other, None)) is None
+    assert scale.command_ratio(CheckContext(dataclasses.replace(drive, command=None), None)) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "words"),
+    [
+        (0.03, 0.015, "3.0% too much"), (-0.03, 0.015, "3.0% too little"), (0.019, 0.001, ""),
+        (0.021, 0.001, "2.1% too much"), (0.021, 0.012, ""), (0.199, 0.001, "19.9% too much"),
+        (0.201, 0.001, ""), (-0.201, 0.001, ""), (0.1, 0.0249, "10.0% too much"), (0.1, 0.0251, ""),
+    ],
+)  # fmt: skip
+def test_from_which_gyro_scale_on(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, value: float, half: float, words: str
+) -> None:
+    error = BootstrapInterval(value, value - half, value + half)
+    monkeypatch.setattr(scale, "_by_truth", lambda _: None)
+    monkeypatch.setattr(scale, "_by_path", lambda _: (error, "the path of the fixes"))
+    found = list(scale.check_gyro_scale(CheckContext(drive, None)))
+    assert [finding.what for finding in found] == ([f"gyro z reads {words}"] if words else [])
+    if words:
+        assert found[0].evidence == (
+            f"{1.0 + value:.4f} times the turns by the path of the fixes, 95 % interval "
+            f"{1.0 + value - half:.4f} to {1.0 + value + half:.4f}"
+        )
+        assert found[0].repair is not None
+        imu, repaired = drive.imu, found[0].repair(drive).imu
+        assert imu is not None
+        assert repaired is not None
+        assert repaired.gyro_radps == pytest.approx(imu.gyro_radps * [1.0, 1.0, 1.0 / (1.0 + value)])
+
+
+def test_a_gyro_with_holes_has_no_scale(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = BootstrapInterval(0.05, 0.04, 0.06)
+    monkeypatch.setattr(scale, "_by_truth", lambda _: (error, "the truth's yaw"))
+    assert drive.imu is not None
+    for share, found in ((0.009, 1), (0.011, 0)):
+        gyro = drive.imu.gyro_radps.copy()
+        gyro[: round(share * len(gyro)), 2] = np.nan
+        holed = dataclasses.replace(drive, imu=dataclasses.replace(drive.imu, gyro_radps=gyro))
+        assert len(list(scale.check_gyro_scale(CheckContext(holed, None)))) == found
+    assert not list(scale.check_gyro_scale(CheckContext(dataclasses.replace(drive, imu=None), None)))
+
+
+def test_the_truth_tells_the_scale_of_the_gyro(drive: Recording) -> None:
+    assert drive.imu is not None
+    faster = dataclasses.replace(
+        drive, imu=dataclasses.replace(drive.imu, gyro_radps=drive.imu.gyro_radps * 1.06)
+    )
+    for recording, value in ((drive, 0.0), (faster, 0.06)):
+        found = scale._by_truth(CheckContext(recording, None))
+        assert found is not None
+        interval, source = found
+        assert source == "the truth's yaw"
+        assert interval.value == pytest.approx(value, abs=0.006)
+        assert interval.low < interval.value < interval.high
+        assert interval.high - interval.low < 0.05
+    assert scale._by_truth(CheckContext(dataclasses.replace(drive, truth=None), None)) is None
+
+
+@pytest.mark.parametrize(("windows", "used"), [(7, None), (8, "the path of the truth")])
+def test_a_path_of_few_stretches_tells_none(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, used: str | None
+) -> None:
+    error = BootstrapInterval(0.05, 0.04, 0.06)
+    models = {"gnss": None, "truth": SimpleNamespace(windows=windows, gyro_scale=error)}
+    monkeypatch.setattr(scale, "path_by", lambda _, source: source)
+    monkeypatch.setattr(scale, "path_model", lambda _, path: models[path])
+    found = scale._by_path(CheckContext(drive, None))
+    assert found == (None if used is None else (error, used))
