@@ -60,8 +60,11 @@ TARGETS = {
     ),
     "fusion/calibration/online.py": ("tests/fusion/calibration/test_online.py",),
     "fusion/estimator/skid.py": ("tests/fusion/estimator/test_skid_rules.py",),
-    "datasets/checks/delays.py": ("tests/datasets/checks/test_delay_rules.py",),
-    "datasets/checks/scale.py": ("tests/datasets/checks/test_scale_rules.py",),
+    "datasets/checks/delays.py": ("tests/datasets/checks/test_delay_rules.py", "tests/datasets/checks/test_timing.py"),
+    "datasets/checks/scale.py": (
+        "tests/datasets/checks/test_scale_rules.py",
+        "tests/datasets/checks/test_physical_faults.py",
+    ),
     "fusion/calibration/slip.py": ("tests/fusion/calibration/test_slip.py",),
     "fusion/estimator/learned_numbers.py": (
         "tests/fusion/estimator/test_learned_doubt.py",

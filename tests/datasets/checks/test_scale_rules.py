@@ -51,7 +51,7 @@ def codes(findings: list[Finding]) -> list[str]:
     [
         (1.0, 0.001, 0.0, []), (1.039, 0.001, 0.0, []), (1.041, 0.001, 0.0, ["wheel-radius"]),
         (1.041, 0.022, 0.0, []), (1.041, 0.02, 0.0, ["wheel-radius"]), (1.09, 0.001, 0.05, []),
-        (1.093, 0.001, 0.05, ["wheel-radius"]), (0.801, 0.15, 0.0, []), (0.799, 0.15, 0.0, ["wheel-scale"]),
+        (1.093, 0.001, 0.05, ["wheel-radius"]), (1.093, 0.023, 0.05, []), (0.801, 0.15, 0.0, []), (0.799, 0.15, 0.0, ["wheel-scale"]),
         (0.93, 0.009, 0.0, ["wheel-scale"]), (0.93, 0.011, 0.0, []), (0.98, 0.001, 0.05, ["wheel-scale"]),
         (0.99, 0.001, 0.05, []),
     ],
@@ -133,8 +133,10 @@ def test_a_descent_needs_fixes_that_lie_apart(drive: Recording) -> None:
         assert scale._descent(few) == 0.0
     near = sloping(drive, 0.5)
     assert near.gnss is not None
-    enu = near.gnss.enu_m * 0.009
-    assert scale._descent(dataclasses.replace(near, gnss=dataclasses.replace(near.gnss, enu_m=enu))) == 0.0
+    for metres, descent in ((0.9, 0.0), (1.1, 0.5)):
+        enu = near.gnss.enu_m * 0.01 * metres
+        short = dataclasses.replace(near, gnss=dataclasses.replace(near.gnss, enu_m=enu))
+        assert scale._descent(short) == pytest.approx(descent)
 
 
 def test_soft_ground_explains_slip(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,6 +186,16 @@ def test_units_that_explain_the_ratio(
         assert codes(judged(slow, monkeypatch, ratio, spread=0.05)) == ["wheel-scale"], "a usual speed"
 
 
+@pytest.mark.parametrize(("name", "factor"), [("km/h", 1.0 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)])
+def test_units_of_speeds(drive: Recording, monkeypatch: pytest.MonkeyPatch, name: str, factor: float) -> None:
+    assert drive.wheels is not None
+    speed = drive.wheels.speed * RADIUS_M / factor
+    other = dataclasses.replace(drive, wheels=dataclasses.replace(drive.wheels, unit="mps", speed=speed))
+    (finding,) = judged(other, monkeypatch, factor)
+    assert f"look like {name}:" in finding.what
+    assert finding.fix == f"multiply them by {factor:.6g}"
+
+
 def test_a_command_decides_between_units(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scale.command_ratio(CheckContext(drive, None)) == pytest.approx(1.0, abs=0.05)
     assert drive.wheels is not None
@@ -205,7 +217,7 @@ def test_a_command_that_the_wheels_do_not_follow_says_nothing(drive: Recording) 
         np.full(len(drive.command), np.nan),
         np.zeros(len(drive.command)),
         np.where(np.arange(len(drive.command)) < 9, 1.0, np.nan),
-        np.random.default_rng(0).normal(size=len(drive.command)),
+        np.random.default_rng(0).normal(1.0, 3.0, size=len(drive.command)),
     ):
         other = dataclasses.replace(drive, command=dataclasses.replace(drive.command, v_mps=v_mps))
         assert scale.command_ratio(CheckContext(other, None)) is None
@@ -266,6 +278,11 @@ def test_the_truth_tells_the_scale_of_the_gyro(drive: Recording) -> None:
         assert interval.low < interval.value < interval.high
         assert interval.high - interval.low < 0.05
     assert scale._by_truth(CheckContext(dataclasses.replace(drive, truth=None), None)) is None
+    assert drive.truth is not None
+    for end_s, enough in ((54, True), (50, False)):
+        truth = drive.truth.select(drive.truth.t_ns < drive.start_ns + end_s * 10**9)
+        shorter = CheckContext(dataclasses.replace(drive, truth=truth), None)
+        assert (scale._by_truth(shorter) is not None) == enough
 
 
 @pytest.mark.parametrize(("windows", "used"), [(7, None), (8, "the path of the truth")])
