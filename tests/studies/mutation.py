@@ -60,7 +60,10 @@ TARGETS = {
     ),
     "fusion/calibration/online.py": ("tests/fusion/calibration/test_online.py",),
     "fusion/estimator/skid.py": ("tests/fusion/estimator/test_skid_rules.py",),
-    "datasets/checks/delays.py": ("tests/datasets/checks/test_delay_rules.py", "tests/datasets/checks/test_timing.py"),
+    "datasets/checks/delays.py": (
+        "tests/datasets/checks/test_delay_rules.py",
+        "tests/datasets/checks/test_timing.py",
+    ),
     "datasets/checks/scale.py": (
         "tests/datasets/checks/test_scale_rules.py",
         "tests/datasets/checks/test_physical_faults.py",
