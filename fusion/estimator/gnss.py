@@ -22,7 +22,6 @@ from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_ma
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
 from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, NAV, POSE, SLIP, VELOCITY, cross
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
@@ -397,7 +396,7 @@ class GnssUpdater:
             chain.add_velocity(k, GnssVelocity(at_keyframe, sigma, self.antenna_m, turned))
         else:
             lever_mps = at.R @ cross(at.rate_radps, at.antenna_m)
-            chain.add(k, gnss_velocity(k, at_keyframe - lever_mps, sigma), "V")
+            chain.add_velocity(k, GnssVelocity(at_keyframe - lever_mps, sigma))
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
         """The velocity (3,) of a fix, NaN where not measured; None where there is none that a robot has."""

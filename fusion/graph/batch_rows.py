@@ -310,7 +310,7 @@ class _Fixes:
 
 
 class _Velocities:
-    """`velocity_factor.residual` and `jacobians` of many velocities; only a calibration has them."""
+    """`velocity_factor.residual` and `jacobians` of many velocities."""
 
     def __init__(self, measurements: list[list[GnssVelocity]], used: Places) -> None:
         flat, self._at, self._row = _first_rows(measurements, used)
@@ -318,7 +318,7 @@ class _Velocities:
             np.array([getattr(one, name) for one in flat]).reshape(-1, 3)
             for name in ("velocity_mps", "lever_m")
         )
-        self._swing = np.array([one.lever_rate_radps for one in flat]).reshape(-1, 3, 3)
+        self._swing = np.array([one.swing for one in flat]).reshape(-1, 3, 3)
         self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 3, 1)
 
     def fill(self, rows: Array, values: gtsam.Values, begin: int, R: Array, linear: Array) -> None:
@@ -334,7 +334,8 @@ class _Velocities:
         H = np.zeros((len(at), 3, dim + 1))
         H[:, :, :3] = np.cross(R, lever_velocity[:, None, :]) * -1.0  # -R skew(s), row by row
         H[:, :, VELOCITY] = np.eye(3)
-        H[:, :, ANTENNA] = (R @ self._swing)[:, :, :2]
+        if dim >= ANTENNA.stop:
+            H[:, :, ANTENNA] = (R @ self._swing)[:, :, :2]
         H[:, :, -1] = self._velocity - velocity - np.einsum("kij,kj->ki", R, lever_velocity)
         place = (self._row[:, None] + np.arange(3))[:, :, None]
         rows[at[:, None, None], place, np.r_[0:dim, 2 * dim]] = H / self._sigma

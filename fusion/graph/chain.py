@@ -118,7 +118,7 @@ class Chain:
             self.archive.add_fix(k, fix)
 
     def add_velocity(self, k: int, velocity: GnssVelocity) -> None:
-        """Add a GNSS velocity to keyframe k; without a calibration it is a prior of the velocity instead."""
+        """Add a GNSS velocity to keyframe k."""
         self._changed(k).velocities.append(velocity)
         if self.archive is not None:
             self.archive.add_velocity(k, velocity)

@@ -116,11 +116,6 @@ def antenna_lever(
     return np.asarray(moved + turned)
 
 
-def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: Array) -> gtsam.NonlinearFactor:
-    """Velocity (3,) of the body origin, that of the lever arm removed, with 1 sigma (3,)."""
-    return gtsam.PriorFactorVector(V(k), velocity_mps, gtsam.noiseModel.Diagonal.Sigmas(sigma_mps))
-
-
 def mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     """Mean angular rate (3,) and specific force (3,) over the segments."""
     dt_s = np.array([s.dt_s for s in segments])[:, None]

@@ -1,15 +1,15 @@
-"""The GNSS velocity factor of a calibration, in which the lever arm is a state.
+"""The GNSS velocity factor: a prior of the velocity or, in a calibration, with the lever arm as a state.
 
 Residual (3,), world frame, m/s::
 
     r = v + R L (lever + antenna) - measured
 
 `v` and R are those of the keyframe, L (`lever_arm_velocity`) gives the velocity of a point of the turning
-body. Without a calibration the velocity of the body origin is a prior instead (`factors.gnss_velocity`);
-with one, such priors would hold the velocity to the lever arm assumed when they came.
+body. Without a calibration the measured velocity is that of the body origin and L is missing: r = v -
+measured. In a calibration such priors would hold the velocity to the lever arm assumed when they came.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.key_state import ANTENNA, MARKOV, NAV, POSE, VELOCITY, KeyState, skew
 
+_AXES = np.arange(3)
 _ANTENNA = slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
 
 
@@ -25,16 +26,21 @@ class GnssVelocity:
     """A receiver's velocity, propagated to a keyframe.
 
     Attributes:
-        velocity_mps: (3,) of the antenna, world.
+        velocity_mps: (3,) of the antenna, or of the body origin, world.
         sigma_mps: 1 sigma (3,), white; large along an axis that is not measured.
         lever_m: (3,) the antenna's place in the vehicle file, body.
-        lever_rate_radps: (3, 3), see `lever_arm_velocity`.
+        lever_rate_radps: (3, 3), see `lever_arm_velocity`; None where the velocity is the body origin's.
     """
 
     velocity_mps: Array
     sigma_mps: Array
-    lever_m: Array
-    lever_rate_radps: Array
+    lever_m: Array = field(default_factory=lambda: np.zeros(3))
+    lever_rate_radps: Array | None = None
+
+    @property
+    def swing(self) -> Array:
+        """`lever_rate_radps`, zero where there is none."""
+        return np.zeros((3, 3)) if self.lever_rate_radps is None else self.lever_rate_radps
 
 
 def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
@@ -49,7 +55,7 @@ def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
 def residual(velocity: GnssVelocity, pose: Any, velocity_mps: Array, linear: Array) -> Array:
     """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
-    lever_velocity = pose.rotation().matrix() @ velocity.lever_rate_radps @ lever
+    lever_velocity = pose.rotation().matrix() @ velocity.swing @ lever
     return np.asarray(velocity_mps + lever_velocity - velocity.velocity_mps)
 
 
@@ -58,14 +64,18 @@ def jacobians(velocity: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, 
     R = pose.rotation().matrix()
     lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
     H_pose, H = np.zeros((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))
-    H_pose[:, :3] = -R @ skew(velocity.lever_rate_radps @ lever)
-    H[:, _ANTENNA] = (R @ velocity.lever_rate_radps)[:, :2]
+    H_pose[:, :3] = -R @ skew(velocity.swing @ lever)
+    H[:, _ANTENNA] = (R @ velocity.swing)[:, :2]
     return H_pose, np.eye(3), H
 
 
 def rows(velocity: GnssVelocity, point: KeyState, dim: int) -> Array:
     """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
     out = np.zeros((3, dim + 1))
+    if velocity.lever_rate_radps is None:
+        out[_AXES, VELOCITY.start + _AXES] = 1.0 / velocity.sigma_mps
+        out[:, dim] = (velocity.velocity_mps - point.velocity) / velocity.sigma_mps
+        return out
     H_pose, H_velocity, H_linear = jacobians(velocity, point.pose, point.linear)
     out[:, POSE], out[:, VELOCITY], out[:, NAV.stop : dim] = H_pose, H_velocity, H_linear[:, : dim - NAV.stop]
     out[:, dim] = -residual(velocity, point.pose, point.velocity, point.linear)

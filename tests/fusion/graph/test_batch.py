@@ -13,8 +13,8 @@ from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import ANTENNA, IMU_ROTATION, LINEAR, KeyState
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
+from terrafusion.fusion.graph.key_state import ANTENNA, DIM, IMU_ROTATION, LINEAR, VELOCITY, KeyState
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity, rows
 from tests.fusion.graph.test_chain import SIGMAS, STEP, drive, iso
 
 NS = 100_000_000
@@ -42,9 +42,8 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
             lever, velocity = np.array([0.2, 0.1 * i, 0.3]), np.array([0.9, 0.3, 0.0])
             fix = GnssPosition(fixes[k], lever, np.array([0.3, 0.4, 1.0]), 0.7, velocity, delay_s=0.02)
             chain.add_fix(k, fix)
-            if calibrate:
-                turned = lever_arm_velocity(np.array([0.1, -0.2, 0.3 * k]), -0.05)
-                chain.add_velocity(k, GnssVelocity(velocity, np.array([0.1, 0.2, 9.0]), lever, turned))
+            turned = lever_arm_velocity(np.array([0.1, -0.2, 0.3 * k]), -0.05) if calibrate else None
+            chain.add_velocity(k, GnssVelocity(velocity, np.array([0.1, 0.2, 9.0]), lever, turned))
     return chain
 
 
@@ -55,18 +54,28 @@ def test_rows_are_those_of_the_chain(calibrate: bool) -> None:
     chain.rebuild()
     block = RowBlock(chain.nodes, 0, 0, 12)
     linear = np.array([node.point.linear for node in chain.nodes])
-    rows, counts = block.rows(chain.values, linear)
+    found_rows, counts = block.rows(chain.values, linear)
     for k in range(11):
         wanted = chain._stacked(k)[len(chain.nodes[k].prior) :]
-        found = rows[k, chain.dim : counts[k]]
+        found = found_rows[k, chain.dim : counts[k]]
         scale = np.sqrt(np.diag(wanted.T @ wanted)) + 1e-6
         np.testing.assert_allclose(
             found.T @ found / np.outer(scale, scale), wanted.T @ wanted / np.outer(scale, scale), atol=1e-12
         )
-        assert not rows[k, counts[k] :].any()
+        assert not found_rows[k, counts[k] :].any()
     if calibrate:
-        assert rows[0, :, IMU_ROTATION].any()
-        assert rows[1, :, ANTENNA].any()
+        assert found_rows[0, :, IMU_ROTATION].any()
+        assert found_rows[1, :, ANTENNA].any()
+
+
+def test_a_velocity_of_the_body_origin_is_a_prior_of_the_velocity() -> None:
+    point, sigma = drive(3, seed=2)[0][1], np.array([0.1, 0.2, 9.0])
+    prior = rows(GnssVelocity(point.velocity + 0.3, sigma), point, DIM)
+    assert np.count_nonzero(prior) == 6
+    np.testing.assert_allclose(prior[:, VELOCITY], np.diag(1.0 / sigma))
+    np.testing.assert_allclose(prior[:, DIM], 0.3 / sigma)
+    no_lever = GnssVelocity(point.velocity + 0.3, sigma, np.zeros(3), np.zeros((3, 3)))
+    np.testing.assert_allclose(prior, rows(no_lever, point, DIM), atol=1e-15)
 
 
 def test_blocks_hand_on_what_they_know(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -144,5 +144,5 @@ def _fix(fix: GnssPosition, k: int, kind: Graph) -> gtsam.NonlinearFactor:
 def _velocity(told: GnssVelocity, k: int, kind: Graph) -> gtsam.NonlinearFactor:
     if kind is Graph.FULL:
         return gtsam_factors.gnss_velocity_factor(told, X(k), V(k), M(k))
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, told.sigma_mps)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(told.sigma_mps)
     return gtsam.PriorFactorVector(V(k), told.velocity_mps, noise)
