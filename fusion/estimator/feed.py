@@ -12,7 +12,7 @@ import numpy as np
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.heap import older_objects_unsearched
-from terrafusion.datasets.core.messages import MagnetometerSample, Message
+from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample, Message
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -120,7 +120,9 @@ def _fed(
     newest = estimator.latest()
     for message in _until(messages, last_ns):
         begun = time.perf_counter()
-        if isinstance(message, MagnetometerSample):
+        if isinstance(message, ImuSample):  # complete, as `with_usable_samples` leaves them
+            estimator.add_imu(*message)
+        elif isinstance(message, MagnetometerSample):
             estimator.add_magnetic_field(*message)
         else:
             estimator.add(message)

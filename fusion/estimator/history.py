@@ -58,12 +58,8 @@ class History:
         keys, covariances = batch.states(), batch.covariances()
         offset = len(keys) - len(self.states)
         imu, keyframe_s = config.rig.sensors.imu, config.keyframe_s
-        self.states = [
-            smoothed(state, was, key, P, gyro_sigma_radps(imu, keyframe_s, noise))
-            for state, was, key, P, noise in zip(
-                self.states, live, keys[offset:], covariances[offset:], self.noises, strict=True
-            )
-        ]
+        sigma_radps = np.array([gyro_sigma_radps(imu, keyframe_s, noise) for noise in self.noises])
+        self.states = smoothed(self.states, live, keys[offset:], covariances[offset:], sigma_radps)
         if aligned:
             self.states = [
                 dataclasses.replace(state, status="outage") if state.status == "no_gnss" else state

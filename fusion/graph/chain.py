@@ -198,17 +198,18 @@ class Chain:
 
     def _eliminate_all(self) -> None:
         """Eliminate what changed, and solve for the newest keyframe."""
-        if self._dirty > self.last:
+        last = self.last
+        if self._dirty > last:
             return
         self._insert_new()
-        for k in range(max(self._dirty, self.first), self.last):
+        for k in range(max(self._dirty, self.first), last):
             self._eliminate(k)
         node = self.nodes[-1]
         # What elimination leaves of the keyframes before is a triangle: alone it is the root itself.
-        alone = len(self.nodes) > 1 and not measured_rows(node, self.last, self.values)
-        self._root = node.prior if alone else triangular(own_rows(node, self.last, self.values))
+        alone = len(self.nodes) > 1 and not measured_rows(node, last, self.values)
+        self._root = node.prior if alone else triangular(own_rows(node, last, self.values))
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
-        self._dirty = self.last + 1
+        self._dirty = last + 1
         vars(self).pop("_covariance", None)
 
     def forget(self, keep: int) -> None:

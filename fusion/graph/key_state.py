@@ -151,10 +151,10 @@ class KeyState:
 
 
 def linear_sigma(P: Array) -> Array:
-    """1 sigma (15,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
-    out = np.full(len(LINEAR), np.nan)
-    estimated = P.diagonal()[NAV.stop :]
-    np.sqrt(estimated, out=out[: len(estimated)])
+    """1 sigma (..., 15) of the linear states from covariances (..., dim, dim); NaN where not estimated."""
+    out = np.full((*P.shape[:-2], len(LINEAR)), np.nan)
+    estimated = P.diagonal(axis1=-2, axis2=-1)[..., NAV.stop :]
+    np.sqrt(estimated, out=out[..., : estimated.shape[-1]])
     return out
 
 

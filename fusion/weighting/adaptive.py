@@ -245,7 +245,7 @@ class TerrainNoise:
         self.noise = self.policy.blend(self._shares, self._grade, (*self._slips, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return
-        before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)
+        before, now = vars(self._recorded), vars(self.noise)
         best = int(p.argmax())
         why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
         for name, (sensor, unit) in _RECORDED.items():
