@@ -55,7 +55,7 @@ def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, monkeyp
     )
     here = moved_to(log, first, log.start, moved)
     for mine, its in zip(here, there, strict=True):
-        for name in ("value", "by_effect", "by_pose", "heading"):
+        for name in ("value", "by_effect", "by_patch", "by_pose", "heading"):
             np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=within)
     east = [o.channel for o in log.observed].index("gnss_east_m")
     assert np.abs(here[east].by_effect - first[east].by_effect).max() > 1e-3

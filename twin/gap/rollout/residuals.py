@@ -235,8 +235,7 @@ def residuals_from(
         own = _sensor_states(observed.channel, s.value, model.vehicle)
         by_state.append(np.hstack([s.by_effect[:, soil], own]))
         by_nuisance.append(nuisance_columns(log, model, observed, s.heading, channels))
-    K = len(candidates.keys)
-    by_effect, by_patch = [s.by_effect[:, :K] for s in found], [s.by_effect[:, K:] for s in found]
+    by_effect, by_patch = [s.by_effect for s in found], [s.by_patch for s in found]
     by_pose = [s.by_pose for s in found]
     return RunResiduals(log, np.zeros(len(soil)), error, by_state, by_effect, by_nuisance, by_pose, by_patch)
 

@@ -69,11 +69,12 @@ class Linearisation:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """One channel: prediction (n,), derivatives by columns and patches (n, K + D), in typical sizes, and the
-    pose (n, 3), heading (n,)."""
+    """One channel: prediction (n,), derivatives by the columns (n, K), in typical sizes, by patches (n, D)
+    and by the pose (n, 3), heading (n,)."""
 
     value: Array
     by_effect: Array
+    by_patch: Array
     by_pose: Array
     heading: Array
 
@@ -233,8 +234,7 @@ def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitiv
             weighted_means(coarse, _channel(part, observed.channel))
             for part in (run.by_effect, run.by_patch, run.by_pose)
         )
-        by_effect = np.hstack([by_effect, by_patch])
-        out.append(Sensitivity(value, by_effect, by_pose, run.heading[coarse[0][:, 2]]))
+        out.append(Sensitivity(value, by_effect, by_patch, by_pose, run.heading[coarse[0][:, 2]]))
     return out
 
 
@@ -260,8 +260,11 @@ def moved_to(log: PreparedLog, channels: Sequence[Sensitivity], old: Array, new:
         ):  # fmt: skip
             by_pose = s.by_pose.copy()  # the derivatives by x and y do not depend on the pose
             by_pose[:, 2] = p * a.by_pose[:, 2] + q * b.by_pose[:, 2]
-            by_effect = p[:, None] * a.by_effect + q[:, None] * b.by_effect
-            out[i] = Sensitivity(p * x + q * y + origin, by_effect, by_pose, s.heading)
+            by_effect, by_patch = (
+                p[:, None] * one + q[:, None] * other
+                for one, other in ((a.by_effect, b.by_effect), (a.by_patch, b.by_patch))
+            )
+            out[i] = Sensitivity(p * x + q * y + origin, by_effect, by_patch, by_pose, s.heading)
     return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, window, strict=True)]
 
 
