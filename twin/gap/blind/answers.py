@@ -1,5 +1,6 @@
 """Trials given to a diagnosis and its opponent, and their answers: one line of JSON a trial."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.files import unwritable, write_atomically
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.gap.blind import seal
@@ -129,17 +130,30 @@ def answer_all(
 
 def _stored(path: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> Iterator[dict[str, Any]]:
     """Entries as they come, each appended to the file."""
-    with (
-        open_workers(pool.backend, pool.jobs, pool.address) as found,
-        path.open("a", encoding="utf-8") as file,
-    ):
+    with open_workers(pool.backend, pool.jobs, pool.address) as found:
         # Recordings are large: no more of them at once than are worked on soon.
         workers = dataclasses.replace(found, at_once=found.at_once or 2 * pool.jobs)
         for entry in workers.results(answer, questions):
+            _append(path, entry)
+            yield entry
+
+
+def _append(path: Path, entry: Mapping[str, Any]) -> None:
+    """One more line; where the disk is full, the file stays as it was.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    size = path.stat().st_size if path.exists() else 0
+    try:
+        with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
             file.flush()
             os.fsync(file.fileno())
-            yield entry
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            os.truncate(path, size)
+        raise unwritable(path, error) from None
 
 
 def answer(case: BlindCase, methods: Mapping[str, Diagnose], sealed: Path | None) -> dict[str, Any]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.twin.gap.blind import seal
-from terrafusion.twin.gap.blind.answers import answered
+from terrafusion.twin.gap.blind.answers import _append, answered
 from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.plan import (
     PLAIN,
@@ -95,3 +97,18 @@ def test_a_check_that_runs_out_of_time_scores_what_is_answered(tmp_path: Path) -
     assert list(answered(tmp_path)) == ["trial-0001"]
     again = run_blind_check(tmp_path, fake.guess, scale=TINY, seed=2)
     assert again == scores  # the labels are open: nothing is answered any more
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _append(tmp_path / seal.ANSWERS, {"trial": 1})
+    before = (tmp_path / seal.ANSWERS).read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DataError, match=r"cannot be written: No space left"):
+        _append(tmp_path / seal.ANSWERS, {"trial": 2})
+    assert (tmp_path / seal.ANSWERS).read_bytes() == before == b'{"trial": 1}\n'
