@@ -72,6 +72,8 @@ def verdict_line(d: GapDiagnosis) -> str:
         if d.drives is not None and limited:
             covered = f"which cover {percent(d.drives.covered)} of the time of these drives"
             return f"No gap as far as the references tell, {covered} ({_test(d)})."
+        if d.evidence.patchier is not None:
+            return f"No gap, but the ground varies more along the path than the references' ({_test(d)})."
         like = "the references among themselves" if d.references else "the twin's own runs"
         return f"No gap: the runs differ no more than {like} ({_test(d)})."
     if verdict.kind == "unknown":

@@ -235,6 +235,8 @@ def test_undecided_on_patchier_ground_where_the_test_is_not_sure(wide: GapDiagno
     answer = checked(found)
     assert (answer["verdict"], answer["named"], answer["gap"]["detected"]) == ("no_gap", [], False)
     assert "and so does the ground, which varies more" in " ".join(" ".join(screen(found)).split())
+    none = diagnose_evidence(patchier, "elevate", significance=0.5 * least)
+    assert screen(none)[0].startswith("No gap, but the ground varies more along the path")
 
 
 def test_sets_and_drives_of_an_answer(wide: GapDiagnosis) -> None:
