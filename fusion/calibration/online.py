@@ -37,6 +37,7 @@ class SelfCalibration:
         before: the numbers when the stretch under way began.
         misfit: variance of the fixes' residuals at the last step over that of their noise.
         usual_sigma_m: median 1 sigma of the newest fixes.
+        turned_rad: turns of the stretch under way, of either sign.
     """
 
     def __init__(self, prior: Knowledge, noise: Noise, antenna_m: complex) -> None:
@@ -59,7 +60,7 @@ class SelfCalibration:
         self._samples: list[tuple[float, float, float]] = []
         self._fixes: list[tuple[float, float, float, float]] = []
         self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
-        self.usual_sigma_m = 0.0
+        self.usual_sigma_m = self.turned_rad = 0.0
         self._state: Array | None = None
         self._work: Reduction | None = None
         self._reduced = False
@@ -89,6 +90,7 @@ class SelfCalibration:
         self._now_s = (t_ns - self._start_ns) * 1e-9
         self._samples.append((self._now_s, distance_m, turn_rad))
         self._rolled_m += abs(distance_m)
+        self.turned_rad += abs(turn_rad)
         apart_s = self._now_s - self._node_s
         if node_due(apart_s, self._rolled_m, self.usual_sigma_m):
             self._first.append(len(self._drive.distance_m) + len(self._samples))

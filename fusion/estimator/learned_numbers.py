@@ -57,10 +57,10 @@ MOST_SPREAD = 0.1
 """Spread of slip beyond which the wheels do not roll, and a slide looks like a delay (assumed)."""
 SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
 """A slide shows within this time (assumed); so many steps of learning reach further back."""
-LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
-"""Fixes later than this (wheels that spin look less late), another antenna or another gyro can look like a
-slide; they explain it if the fixes then lie within about three of their sigma: a slide leaves a hundred and
-more (assumed)."""
+LEAST_LATE_S, LEAST_LATE_TURNING_S, TURNING_RAD, MOST_MISFIT = 0.3, 0.15, 3.0, 10.0
+"""Fixes later than the first (wheels that spin look less late), or than the second where the robot turned by
+so much, another antenna or another gyro can look like a slide; they explain it if the fixes then lie within
+about three of their sigma: a slide leaves a hundred and more (assumed)."""
 CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
@@ -225,7 +225,8 @@ class LearnedNumbers:
         if learning.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
             return False
         least = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
-        least[CORRECTED.index(GNSS_DELAY)] = LEAST_LATE_S
+        turning = learning.turned_rad > TURNING_RAD
+        least[CORRECTED.index(GNSS_DELAY)] = LEAST_LATE_TURNING_S if turning else LEAST_LATE_S
         return bool((np.abs(known.mean - self._before.mean)[CORRECTED] > least).any())
 
     def _forget(self, known: Knowledge) -> None:

@@ -170,19 +170,21 @@ def test_numbers_known_before_the_drive_explain_no_slide(
 
 
 @pytest.mark.parametrize(
-    ("number", "off", "misfit", "explained"),
+    ("number", "off", "misfit", "turned_rad", "explained"),
     [
-        (ANTENNA_X, 0.25, 2.0, True),
-        (TURN_SCALE, 0.02, 2.0, True),
-        (GNSS_DELAY, 0.35, 2.0, True),
-        (ANTENNA_X, 0.1, 2.0, False),  # as slip in turns
-        (GNSS_DELAY, 0.25, 2.0, False),  # as wheels that spin on ice
-        (ANTENNA_X, 0.25, 100.0, False),  # the fixes lie elsewhere
-        (WHEEL_SCALE, 0.2, 2.0, False),  # corrects nothing that looks like a slide
+        (ANTENNA_X, 0.25, 2.0, 0.0, True),
+        (TURN_SCALE, 0.02, 2.0, 0.0, True),
+        (GNSS_DELAY, 0.35, 2.0, 0.0, True),
+        (ANTENNA_X, 0.1, 2.0, 6.0, False),  # as slip in turns
+        (GNSS_DELAY, 0.25, 2.0, 0.0, False),  # as wheels that spin on ice
+        (GNSS_DELAY, 0.25, 2.0, 6.0, True),  # which are no later in turns
+        (GNSS_DELAY, 0.1, 2.0, 6.0, False),
+        (ANTENNA_X, 0.25, 100.0, 6.0, False),  # the fixes lie elsewhere
+        (WHEEL_SCALE, 0.2, 2.0, 6.0, False),  # corrects nothing that looks like a slide
     ],
 )
 def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
-    driving: Estimator, number: int, off: float, misfit: float, explained: bool
+    driving: Estimator, number: int, off: float, misfit: float, turned_rad: float, explained: bool
 ) -> None:
     """A slide takes back what was learned, numbers of a robot with rolling wheels do not."""
     learned, before = driving.learned, driving.learned._before
@@ -190,10 +192,10 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
     mean[number] += off
     learning = driving.learned.calibration
     assert learning is not None
-    was = learning.known, learning.misfit
+    was = learning.known, learning.misfit, learning.turned_rad
     learning.known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0)
-    learning.misfit = misfit
+    learning.misfit, learning.turned_rad = misfit, turned_rad
     assert learned._explained(learning) is explained
     learning.known = dataclasses.replace(learning.known, slip_spread=0.2)
     assert not learned._explained(learning)
-    learning.known, learning.misfit = was
+    learning.known, learning.misfit, learning.turned_rad = was
