@@ -2,7 +2,8 @@
 
 Where the ground is patchier, wheels, gyro and fixes err together, metre by metre. Judged by the references'
 noise that would be a gap. The variance of the patches is estimated in each run beside effects of any size; a
-judged run is whitened with what it has above the references together, whose noise and scatter hold the rest.
+judged run on patchier ground is whitened with what it has above the references together, whose noise and
+scatter hold the rest.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ that fits best, something else is the cause."""
 ANY_SIZE = 30.0  # 1 sigma of effects and functions of the commands beside patches, in their units (assumed)
 LEAST_VALUE = 1e-3  # information on a combination of patches from which it counts
 LEAST_RATIO, LEAST_FACTOR = 1.2, 0.1
-"""Of every judged run's factor over the largest of the references, at least the second, from which ground
+"""Of a judged run's factor over the largest of the references, at least the second, from which its ground
 counts as patchier."""
 PATCHIER = (
     "the ground of these runs varies more along the path than that of the references, about {:.1f} times: "
@@ -58,6 +59,7 @@ def with_patches(
         factors = np.where(best < len(FACTORS) - 1, FACTORS[best], 0.0)
         usual = FACTORS[likelihood[count:].sum(axis=0).argmax()]
         more = np.sqrt(np.maximum(factors[:count] ** 2 - usual**2, 0.0))
+        more[factors[:count] < _limit(factors[count:])] = 0.0
         judged = list(threads.map(_patched, white[:count], parts, more))
     return [*judged, *white[count:]], factors
 
@@ -107,6 +109,11 @@ def patchier(factors: Array, references: int) -> float | None:
     """How many times as much as the references' the ground of the judged runs varies, by the factors of all;
     None unless it does so in each, and more than in any reference."""
     judged, normal = np.split(factors, [len(factors) - references])
-    if not references or judged.min() < LEAST_RATIO * max(normal.max(), LEAST_FACTOR):
+    if not references or judged.min() < _limit(normal):
         return None
     return float(judged.mean() / max(normal.mean(), LEAST_FACTOR))
+
+
+def _limit(normal: Array) -> float:
+    """Factor from which ground is patchier than on the references, whose factors are `normal`."""
+    return float(LEAST_RATIO * max(normal.max(), LEAST_FACTOR))
