@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.gap.data.samples import Indices, sample_map
 
 EAST_NORTH = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
@@ -26,39 +26,59 @@ def alignment_angles(log: PreparedLog, values: Sequence[Array]) -> Array:
     velocities together.
     """
     cross, dot = np.zeros(len(log.windows)), np.full(len(log.windows), HEADING_SIGMA_RAD**-2.0)
-    for shifts, observed, predicted, windows, sigma in _tracks(log, values):
-        for k, rows in windows:
+    for pair, (east, north) in _pairs(log):
+        observed, predicted = _track(log, values, east, north)
+        sigma = float(np.median(log.observed[east].sigma))
+        for k, rows in _windows(log, east):
             a, b = predicted[rows], observed[rows]
-            if shifts:
+            if pair == EAST_NORTH[0]:
                 a, b = a - a.mean(axis=0), b - b.mean(axis=0)
             cross[k] += float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) / sigma**2
             dot[k] += float(np.sum(a * b)) / sigma**2
     return np.arctan2(cross, dot)
 
 
-def aligned(log: PreparedLog, values: Sequence[Array]) -> list[Array]:
-    """Predicted channels with the track of each window aligned with the observed one."""
-    out, angles = list(values), alignment_angles(log, values)
-    index = {o.channel: i for i, o in enumerate(log.observed)}
-    for shifts, observed, predicted, windows, _ in _tracks(log, values):
-        turned = np.empty_like(predicted)
-        for k, rows in windows:
-            turned[rows] = predicted[rows] @ _rotation(angles[k]).T
-            if shifts:
-                turned[rows] += (observed[rows] - turned[rows]).mean(axis=0)
-        for column, channel in enumerate(EAST_NORTH[0 if shifts else 1]):
-            out[index[channel]] = turned[:, column]
-    return out
-
-
 def aligned_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Array:
     """Poses (W, 3) at the windows' starts that align the predictions, made from the poses `start`."""
     out, angles = start.copy(), alignment_angles(log, values)
     out[:, 2] += angles
-    for shifts, observed, predicted, windows, _ in _tracks(log, values):
-        for k, rows in windows if shifts else ():
-            middle = predicted[rows].mean(axis=0)
-            out[k, :2] = observed[rows].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
+    for pair, (east, north) in _pairs(log):
+        if pair == EAST_NORTH[0]:
+            observed, predicted = _track(log, values, east, north)
+            for k, rows in _windows(log, east):
+                middle = predicted[rows].mean(axis=0)
+                out[k, :2] = observed[rows].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
+    return out
+
+
+def moved(log: PreparedLog, values: Sequence[Array], old: Array, new: Array) -> list[Array]:
+    """Predicted channels (n,) from other poses (W, 3) at the windows' starts than the old ones: on a level
+    plane a run shifts and turns as a whole."""
+    about_start = _shifted(log, values, -old[:, :2])
+    return _shifted(log, rotated(log, about_start, new[:, 2] - old[:, 2]), new[:, :2])
+
+
+def rotated(log: PreparedLog, channels: Sequence[Array], angle: Array) -> list[Array]:
+    """Channels (n, ...) with the east and north ones of each window rotated by an angle (W,)."""
+    out = list(channels)
+    for _, (east, north) in _pairs(log):
+        a, b, at = channels[east], channels[north], angle[window_index(log, east)]
+        at = at.reshape(-1, *[1] * (a.ndim - 1))
+        out[east], out[north] = np.cos(at) * a - np.sin(at) * b, np.sin(at) * a + np.cos(at) * b
+    return out
+
+
+def window_index(log: PreparedLog, channel: int) -> Indices:
+    """Number (n,) of the window of each sample of a channel."""
+    return np.clip(window_of(log.observed[channel], log.windows), 0, len(log.windows) - 1)
+
+
+def _shifted(log: PreparedLog, values: Sequence[Array], by: Array) -> list[Array]:
+    """Channels (n,) with the positions of each window shifted by (W, 2)."""
+    out = list(values)
+    for pair, both in _pairs(log):
+        for axis, i in enumerate(both if pair == EAST_NORTH[0] else ()):
+            out[i] = out[i] + by[window_index(log, i), axis]
     return out
 
 
@@ -66,20 +86,18 @@ def _rotation(angle: float) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _tracks(
-    log: PreparedLog, values: Sequence[Array]
-) -> list[tuple[bool, Array, Array, list[tuple[int, Indices]], float]]:
-    """Of positions and velocities that the log has: whether they shift, observed and predicted values (n, 2),
-    windows with their samples, sigma."""
+def _pairs(log: PreparedLog) -> list[tuple[tuple[str, str], tuple[int, int]]]:
+    """Of `EAST_NORTH` what the log has, with the indices of both channels."""
     index = {o.channel: i for i, o in enumerate(log.observed)}
-    out = []
-    for pair in EAST_NORTH:
-        if not all(channel in index for channel in pair):
-            continue
-        both = [index[channel] for channel in pair]
-        first = log.observed[both[0]]
-        observed = np.stack([log.observed[i].value for i in both], axis=1)
-        predicted = np.stack([values[i] for i in both], axis=1)
-        windows = [(k, rows) for i, k, rows in sample_map(log).blocks if i == both[0]]
-        out.append((pair == EAST_NORTH[0], observed, predicted, windows, float(np.median(first.sigma))))
-    return out
+    return [((e, n), (index[e], index[n])) for e, n in EAST_NORTH if e in index and n in index]
+
+
+def _track(log: PreparedLog, values: Sequence[Array], east: int, north: int) -> tuple[Array, Array]:
+    """Observed and predicted values (n, 2) of two channels."""
+    observed = np.stack([log.observed[east].value, log.observed[north].value], axis=1)
+    return observed, np.stack([values[east], values[north]], axis=1)
+
+
+def _windows(log: PreparedLog, channel: int) -> list[tuple[int, Indices]]:
+    """Windows with their samples of a channel."""
+    return [(k, rows) for i, k, rows in sample_map(log).blocks if i == channel]

@@ -36,10 +36,9 @@ class Ladder:
 
     Attributes:
         at: (N,) sizes, ascending, zero among them: the value of each of its parameters, in typical sizes.
-        column: (N,) index of each one's signature in the bank; -1 for zero.
+        column: (N,) index of each one's signature in `SignatureBank.columns`; -1 for zero.
     """
 
-    law: Hypothesis
     at: Array
     column: tuple[int, ...]
 
@@ -55,85 +54,90 @@ class SimulatedSize:
 
 @dataclass(frozen=True, eq=False)
 class SignatureBank:
-    """Signatures (n, Q) of each judged run: by how much a law at a size reduces its whitened error."""
+    """By how much a law at a size reduces the whitened error (n,) of each judged run.
 
-    ladders: Mapping[Hypothesis, Ladder]
-    signatures: list[Array]
+    Attributes:
+        signatures: of each run, by law and size; laws that are not linear have an entry.
+        samples: n of each run.
+    """
+
+    signatures: Mapping[Hypothesis, Mapping[float, Sequence[Array]]]
+    samples: tuple[int, ...]
+
+    @classmethod
+    def empty(cls, evidence: GapEvidence) -> SignatureBank:
+        """Without any law."""
+        return cls({}, tuple(len(run.time_s) for run in evidence.runs))
 
     @classmethod
     def of(cls, evidence: GapEvidence, simulate: bool = True) -> SignatureBank:
         """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones by
         rollout, unless `simulate` is false."""
-        ladders, candidates, points = dict[Hypothesis, Ladder](), evidence.candidates, list[SimulatedSize]()
+        signatures: dict[Hypothesis, dict[float, list[Array]]] = {}
+        candidates, insensitive = evidence.candidates, list[SimulatedSize]()
         columns = [run.by_parameter for run in evidence.runs]
-        first: list[list[Array]] = [[] for _ in columns]
         for law in candidates.hypotheses:
             if not is_simulated(law, candidates):
                 continue
+            slope = [c[:, law.columns].sum(axis=1) for c in columns]
+            square = sum(float(np.square(s).sum()) for s in slope)
             low, high = candidates.bounds(law.columns)
-            steps, far = [(0.0, -1)], list[float]()
-            square = sum(float(np.square(c[:, law.columns].sum(axis=1)).sum()) for c in columns)
-            for end in (float(low.max()), float(high.min())):
-                if end == 0.0:
-                    continue
-                if square * end**2 < INSENSITIVE:
-                    far += [share * end for share in THRESHOLDS]
-                    continue
-                steps.append((end, len(first[0])))
-                for mine, c in zip(first, columns, strict=True):
-                    mine.append(end * c[:, law.columns].sum(axis=1))
-            steps.sort()
-            ladders[law] = Ladder(law, np.array([x for x, _ in steps]), tuple(c for _, c in steps))
-            points += [SimulatedSize(law, x, model_soil(evidence)) for x in far]
-        empty = [np.zeros((len(run.time_s), 0)) for run in evidence.runs]
-        bank = cls(ladders, [np.column_stack([e, *mine]) for e, mine in zip(empty, first, strict=True)])
-        return bank.with_sizes(evidence, points) if simulate else bank
+            signatures[law] = {}
+            for end in {float(low.max()), float(high.min())} - {0.0}:
+                if square * end**2 >= INSENSITIVE:
+                    signatures[law][end] = [end * s for s in slope]
+                elif simulate:
+                    sizes, soils = [share * end for share in THRESHOLDS], model_soil(evidence)
+                    insensitive += [SimulatedSize(law, size, soils) for size in sizes]
+        return dataclasses.replace(cls.empty(evidence), signatures=signatures).with_sizes(
+            evidence, insensitive
+        )
 
     def only(self, laws: Iterable[Hypothesis]) -> SignatureBank:
-        """With the ladders of some laws alone."""
-        kept, columns = dict[Hypothesis, Ladder](), list[int]()
-        for law in laws:
-            if law in self.ladders:
-                old, first = self.ladders[law], len(columns)
-                columns += [c for c in old.column if c >= 0]
-                new = itertools.count(first)
-                kept[law] = dataclasses.replace(
-                    old, column=tuple(c if c < 0 else next(new) for c in old.column)
-                )
-        return SignatureBank(kept, [s[:, columns] for s in self.signatures])
+        """With some laws alone."""
+        kept = {law: self.signatures[law] for law in laws if law in self.signatures}
+        return dataclasses.replace(self, signatures=kept)
+
+    def sizes(self, law: Hypothesis) -> Array:
+        """(N,) ascending, zero among them."""
+        return np.array(sorted((0.0, *self.signatures[law])))
+
+    def ladders(self) -> dict[Hypothesis, Ladder]:
+        """By law."""
+        count = itertools.count()
+        return {
+            law: Ladder(at, tuple(next(count) if size else -1 for size in at))
+            for law, at in ((law, self.sizes(law)) for law in self.signatures)
+        }
+
+    def columns(self) -> list[Array]:
+        """(n, Q) signatures of each run, in the order of the ladders."""
+        every = [own[size] for law, own in self.signatures.items() for size in self.sizes(law) if size]
+        return [
+            np.column_stack([np.zeros((n, 0)), *(of_runs[i] for of_runs in every)])
+            for i, n in enumerate(self.samples)
+        ]
 
     def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> SignatureBank:
         """With further sizes of laws; those at which the twin diverges are left out."""
         runs = range(len(evidence.runs))
         effects = [effects_at(evidence, p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
         tried = [RunWithEffects(r, e, p.soils[r]) for p, e in zip(points, effects, strict=True) for r in runs]
-        place = {(r, p.soils[r].tobytes()): RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs}
+        plain = {(r, p.soils[r].tobytes()): RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs}
         # Unclipped: a large effect is no outlier.
-        errors = whitened_errors(evidence, [*tried, *place.values()], clip=False)
-        on_soil = dict(zip(place, errors[len(tried) :], strict=True))
-        plain = [on_soil[r, p.soils[r].tobytes()] for p in points for r in runs]
-        new: list[list[Array]] = [[] for _ in runs]
-        found: dict[Hypothesis, list[tuple[float, int]]] = {
-            law: list(zip(old.at.tolist(), old.column, strict=True)) for law, old in self.ladders.items()
-        }
-        count = self.signatures[0].shape[1]
+        errors = whitened_errors(evidence, [*tried, *plain.values()], clip=False)
+        without = dict(zip(plain, errors[len(tried) :], strict=True))
+        signatures = dict(self.signatures)
         for i, point in enumerate(points):
-            own = slice(i * len(runs), (i + 1) * len(runs))
-            mine = [error for error in errors[own] if error is not None]
-            without = [error for error in plain[own] if error is not None]
-            if len(mine) < len(runs) or len(without) < len(runs):
-                continue
-            known = found.setdefault(point.law, [(0.0, -1)])
-            apart = [step for step in known if abs(step[0] - point.size) >= APART * abs(point.size)]
-            found[point.law] = [*apart, (point.size, count + len(new[0]))]
-            for signatures, whole, error in zip(new, without, mine, strict=True):
-                signatures.append(whole - error)
-        ladders = dict(self.ladders)
-        for law, steps in found.items():
-            steps.sort()
-            ladders[law] = Ladder(law, np.array([x for x, _ in steps]), tuple(c for _, c in steps))
-        more = [np.column_stack([old, *some]) for old, some in zip(self.signatures, new, strict=True)]
-        return dataclasses.replace(self, ladders=ladders, signatures=more)
+            with_it = errors[i * len(runs) : (i + 1) * len(runs)]
+            pairs = [(without[r, point.soils[r].tobytes()], with_it[r]) for r in runs]
+            new = [whole - error for whole, error in pairs if whole is not None and error is not None]
+            if len(new) == len(runs):
+                near = APART * abs(point.size)
+                known = signatures.get(point.law, {})
+                apart = {size: s for size, s in known.items() if abs(size - point.size) >= near}
+                signatures[point.law] = {**apart, point.size: new}
+        return dataclasses.replace(self, signatures=signatures)
 
 
 def model_soil(evidence: GapEvidence) -> list[Array]:

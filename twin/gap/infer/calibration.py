@@ -18,7 +18,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.explain import Explanation, Sets
 
-SEVERAL = (0.8, 0.17, 0.03)  # prior of one, two and three effects (assumed)
+SEVERAL = (0.8, 0.17)  # prior of one and of two effects (assumed: the rest is for more)
 LAPSE = 0.02  # probability that the evidence does not hold (assumed), spread evenly over all sets
 
 

@@ -69,14 +69,15 @@ class ReferenceGains:
         )
         soils = [residuals.soil for residuals in there.residuals]
         at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in linear}
-        empty = SignatureBank({}, [np.zeros((len(run.time_s), 0)) for run in references])
-        bank = empty.with_sizes(there, [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x])
+        points = [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x]
+        bank = SignatureBank.empty(there).with_sizes(there, points)
         shared = references[0].by_parameter.shape[1]
         column = {i: np.array(laws.names[i].columns) for i in alone if i in linear}
+        ladders = bank.ladders()
         for i in at:
-            own = bank.ladders.get(laws.names[i])
+            own = ladders.get(laws.names[i])
             column[i] = shared + np.array([c for c in own.column if c >= 0] if own else [], dtype=int)
-        used = {i: np.zeros(shared + bank.signatures[0].shape[1] + 2) for i in alone}
+        used = {i: np.zeros(shared + len(bank.signatures) + 2) for i in alone}
         for i, fit in alone.items():
             used[i][column[i]] = fit.values[0] if i in linear else 1.0
         products, extra = products_with_discrepancy(references, evidence.model, bank, used)

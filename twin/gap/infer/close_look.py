@@ -1,4 +1,4 @@
-"""Close look at a few laws: alone, in pairs and triples, each with the discrepancy of its form.
+"""Close look at a few laws: alone and in pairs, each with the discrepancy of its form.
 
 A law is never quite the robot's. Its signature times functions of the commands, which a law of another form
 would depend on, joins the covariance in proportion to the size of the effect (after Kennedy and O'Hagan 2001,
@@ -26,8 +26,8 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 FUNCTIONS = ("speed", "abs_turn", "turn_rate", "acceleration")
 """Factors of a law's signature, with time, each of mean zero and variance one over a run."""
 DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a fifth of the signature)
-PAIRS, FIRST, TRIPLES = 30, 5, 3
-"""Pairs that are fitted: the best to first sight, and all of the best laws; pairs that get a third law."""
+PAIRS, FIRST = 30, 5
+"""Pairs that are fitted: the best to first sight, and all of the best laws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,27 +56,21 @@ class CloseLook:
         return dataclasses.replace(found, gain=found.gain + share, evidence=found.evidence + share)
 
     def search(self) -> dict[tuple[int, ...], Fitted]:
-        """Fits of all laws alone, of all pairs that look promising, and of the best of these with a third."""
-        names = self.laws.names
+        """Fits of all laws alone and of all pairs that look promising."""
         found: dict[tuple[int, ...], Fitted] = {(i,): self.fit((i,)) for i in self.index}
-        order = sorted(self.index, key=lambda i: -found[i,].evidence)
+        best = sorted(self.index, key=lambda i: -found[i,].evidence)[:FIRST]
         guess = self._pairs()
         pairs = {*sorted(guess, key=lambda pair: -guess[pair])[:PAIRS]}
-        pairs |= {(min(p), max(p)) for p in itertools.combinations(order[:FIRST], 2)} & guess.keys()
-        found |= {pair: self.fit(pair) for pair in sorted(pairs)}
-        for pair in sorted(pairs, key=lambda pair: -found[pair].evidence)[:TRIPLES]:
-            present = {names[i].effect for i in pair}
-            more = {tuple(sorted((*pair, i))) for i in self.index if names[i].effect not in present}
-            found |= {three: self.fit(three) for three in sorted(more - found.keys())}
-        return found
+        pairs |= {(min(pair), max(pair)) for pair in itertools.combinations(best, 2)} & guess.keys()
+        return found | {pair: self.fit(pair) for pair in sorted(pairs)}
 
     def _pairs(self) -> dict[tuple[int, int], float]:
         """Log likelihood ratio of every pair of effects to first sight: one at its best alone, the other
         beside it."""
-        m, names, out = self.metric, self.laws.names, dict[tuple[int, int], float]()
-        gains, _, used = self.laws.best(m, m.K[:, m.error])
+        names, out = self.laws.names, dict[tuple[int, int], float]()
+        gains, _, used = self.laws.best(self.metric)
         for a in self.index:
-            beside, _, _ = self.laws.best(m, m.K[:, m.error] - m.K @ used[a])
+            beside, _, _ = self.laws.best(self.metric, used[a])
             for b in self.index:
                 if names[a].effect != names[b].effect:
                     pair = (min(a, b), max(a, b))
@@ -93,13 +87,13 @@ def products_with_discrepancy(
     Args:
         used: (M + 1,) coefficients of each law's signature at its size.
     """
-    shared, count, F = runs[0].by_parameter.shape[1], bank.signatures[0].shape[1], len(FUNCTIONS) + 1
-    out = []
-    for run, signatures in zip(runs, bank.signatures, strict=True):
+    columns, F, out = bank.columns(), len(FUNCTIONS) + 1, list[Products]()
+    first = runs[0].by_parameter.shape[1] + columns[0].shape[1]
+    for run, signatures in zip(runs, columns, strict=True):
         f, own = modulation(run, model), np.column_stack([run.by_parameter, signatures])
         parts = [(own @ w[: own.shape[1]])[:, None] * f for w in used.values()]
         out.append(Products.of(run, np.column_stack([signatures, *parts])))
-    return out, {i: shared + count + F * k + np.arange(F) for k, i in enumerate(used)}
+    return out, {i: first + F * k + np.arange(F) for k, i in enumerate(used)}
 
 
 def modulation(run: WhitenedRun, model: Model) -> Array:

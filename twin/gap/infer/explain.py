@@ -2,9 +2,9 @@
 
 A first look ranks all laws, alone and beside each of the best few, to first order; a second one those that
 looked promising, simulated at their best sizes. The twin is simulated again at the best sizes of the
-promising ones of these, which a close look compares alone, in pairs and triples; what they explain on
-references is subtracted. Where even the best of them leaves more in a channel than the references do, the
-noise of that channel is taken to be larger.
+promising ones of these, which a close look compares alone and in pairs; what they explain on references is
+subtracted. Where even the best of them leaves more in a channel than the references do, the noise of that
+channel is taken to be larger.
 """
 
 from __future__ import annotations
@@ -63,6 +63,21 @@ class Explanation:
 
 
 @dataclass(frozen=True, eq=False)
+class _Look:
+    """The judged runs in the columns of a bank of signatures, and all laws there."""
+
+    bank: SignatureBank
+    runs: list[Products]
+    metric: Metric
+    laws: Laws
+
+    def beside(self, used: Array) -> tuple[Array, list[Array]]:
+        """Gain and values of every law at its best beside others (coefficients (M + 1,))."""
+        gains, values, _ = self.laws.best(self.metric, used)
+        return gains, values
+
+
+@dataclass(frozen=True, eq=False)
 class _Explainer:
     evidence: GapEvidence
     sigma: Array
@@ -73,64 +88,60 @@ class _Explainer:
         weight = np.ones(len(self.evidence.channels)) if weight is None else weight
         return metric(runs, weight, self.sigma, self.robot)
 
-    def look(self, bank: SignatureBank) -> tuple[list[Products], Metric, Laws]:
-        runs = [Products.of(r, s) for r, s in zip(self.evidence.runs, bank.signatures, strict=True)]
+    def look(self, bank: SignatureBank) -> _Look:
+        runs = [Products.of(r, s) for r, s in zip(self.evidence.runs, bank.columns(), strict=True)]
         m = self.metric(runs)
-        return runs, m, Laws.of(self.evidence.candidates, bank.ladders, m.shared, m.none)
+        return _Look(bank, runs, m, Laws.of(self.evidence.candidates, bank.ladders(), m.shared, m.none))
 
-    def points(
-        self, runs: Sequence[Products], laws: Laws, bank: SignatureBank, sizes: Mapping[int, list[Array]],
-        used: Sequence[Array],
-    ) -> list[SimulatedSize]:  # fmt: skip
-        """Where the twin has not been simulated near the best sizes, each run on the soil that fits it beside
-        the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
-        limit, soil, out = (
-            self.evidence.soil_limit,
-            soil_columns(self.evidence.candidates),
-            list[SimulatedSize](),
-        )
-        for i, some in sizes.items():
-            law = laws.names[i]
-            if law not in bank.ladders:
-                continue
-            own = np.array([run.fitted_states(used[i][:-2], self.sigma, self.robot) for run in runs])
-            own = own[:, : len(limit)]
-            for k in (soil.index(column) for column in law.columns if column in soil):
-                own[:, k] -= own[:, k].mean()
-            soils, at = list(np.clip(own, -limit, limit)), bank.ladders[law].at
-            new = [x for x in dict.fromkeys(float(v[0]) for v in some) if np.abs(at - x).min() > _near(x)]
-            out += [SimulatedSize(law, x, soils) for x in new]
-        return out
-
-    def allowed(self, laws: Laws) -> list[int]:
+    def alone(self, look: _Look) -> dict[int, Fitted]:
+        """Fits of single laws, but for those left out."""
         left = {*self.without}
-        return [i for i, h in enumerate(laws.names) if not left & {h.effect, f"{h.effect}/{h.form}"}]
+        names = enumerate(look.laws.names)
+        allowed = [i for i, h in names if not left & {h.effect, f"{h.effect}/{h.form}"}]
+        return {i: look.laws.fit(look.metric, (i,)) for i in allowed}
 
-    def promising(
-        self, m: Metric, laws: Laws, alone: Mapping[int, Fitted], most: int = FIRST
-    ) -> dict[int, list[Array]]:
-        """Laws worth a closer look, with the sizes at which to simulate them."""
+    def promising(self, look: _Look, alone: Mapping[int, Fitted], most: int) -> dict[int, list[float]]:
+        """Laws worth a closer look, with the sizes at which to simulate them (of one size)."""
         order = sorted(alone, key=lambda i: -alone[i].evidence)
-        sizes = {i: [alone[i].values[0]] for i in order[:most]}
+        sizes = {i: [float(alone[i].values[0][0])] for i in order[:most]}
         for i in order[:TRIED]:
-            gains, values, _ = laws.best(m, m.K[:, m.error] - m.K @ alone[i].used)
-            others = [k for k in order if laws.names[k].effect != laws.names[i].effect]
+            gains, values = look.beside(alone[i].used)
+            others = [k for k in order if look.laws.names[k].effect != look.laws.names[i].effect]
             for k in sorted(others, key=lambda k: -gains[k])[:BESIDE]:
-                sizes.setdefault(k, []).append(values[k])
+                sizes.setdefault(k, []).append(float(values[k][0]))
         return sizes
 
-    def first_sizes(self, bank: SignatureBank, sizes: Mapping[int, list[Array]], laws: Laws) -> SignatureBank:
+    def with_first_sizes(self, look: _Look, sizes: Mapping[int, list[float]]) -> SignatureBank:
         """The bank simulated at some sizes, and at larger ones: the sensitivity of a law that saturates makes
         them too small."""
         points, soils = list[SimulatedSize](), model_soil(self.evidence)
         for i, some in sizes.items():
-            law = laws.names[i]
-            if law in bank.ladders:
-                at = bank.ladders[law].at
-                new = {float(v[0]) for v in some}
-                new.add(float(np.clip(GROWTH * some[0][0], at[0], at[-1])))
+            law = look.laws.names[i]
+            if law in look.bank.signatures:
+                known = look.bank.sizes(law)
+                new = {*some, float(np.clip(GROWTH * some[0], known[0], known[-1]))}
                 points += [SimulatedSize(law, x, soils) for x in sorted(new) if abs(x) > LEAST_SIZE]
-        return bank.with_sizes(self.evidence, points)
+        return look.bank.with_sizes(self.evidence, points)
+
+    def with_best_sizes(
+        self, look: _Look, sizes: Mapping[int, list[float]], used: Sequence[Array]
+    ) -> SignatureBank:
+        """The bank simulated where no size is near the best ones, each run on the soil that fits it beside
+        the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
+        limit, soil = self.evidence.soil_limit, soil_columns(self.evidence.candidates)
+        points = list[SimulatedSize]()
+        for i, some in sizes.items():
+            law = look.laws.names[i]
+            if law not in look.bank.signatures:
+                continue
+            own = np.array([run.fitted_states(used[i][:-2], self.sigma, self.robot) for run in look.runs])
+            own = own[:, : len(limit)]
+            for k in (soil.index(column) for column in law.columns if column in soil):
+                own[:, k] -= own[:, k].mean()
+            soils, known = list(np.clip(own, -limit, limit)), look.bank.sizes(law)
+            new = [x for x in dict.fromkeys(some) if np.abs(known - x).min() > _near(x)]
+            points += [SimulatedSize(law, x, soils) for x in new]
+        return look.bank.with_sizes(self.evidence, points)
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
@@ -174,39 +185,43 @@ def explain(
         without: effects, or forms of them (effect/form), that are left out.
     """
     own = _Explainer(evidence, sigma, robot, without)
-    bank = SignatureBank.of(evidence, simulate=close)
-    runs, m, laws = own.look(bank)
-    alone = {i: laws.fit(m, (i,)) for i in own.allowed(laws)}
+    # First look: sensitivities.
+    look = own.look(SignatureBank.of(evidence, simulate=close))
+    alone = own.alone(look)
     if not close:
         one: dict[tuple[int, ...], Fitted] = {(i,): fit for i, fit in alone.items()}
-        return _by_effect(one, alone, laws, own.outside(m), {}, lambda fit: [fit.values] * len(evidence.runs))
-    bank = own.first_sizes(bank, own.promising(m, laws, alone, SECOND), laws)
-    runs, m, laws = own.look(bank)
-    alone = {i: laws.fit(m, (i,)) for i in own.allowed(laws)}
-    sizes = own.promising(m, laws, alone)
-    bank = bank.only(laws.names[i] for i in sizes)
-    runs, m, laws = own.look(bank)
-    gains, values, used = laws.best(m, m.K[:, m.error])
+        runs = len(evidence.runs)
+        return _by_effect(
+            one, alone, look.laws, own.outside(look.metric), {}, lambda fit: [fit.values] * runs
+        )
+    # Second look: the twin simulated at the sizes of the first.
+    look = own.look(own.with_first_sizes(look, own.promising(look, alone, SECOND)))
+    alone = own.alone(look)
+    # The most promising laws alone, simulated until the best sizes are among those simulated.
+    sizes = own.promising(look, alone, FIRST)
+    look = own.look(look.bank.only(look.laws.names[i] for i in sizes))
+    gains, values, used = look.laws.best(look.metric)
     for _ in range(ROUNDS):
-        bank = bank.with_sizes(evidence, own.points(runs, laws, bank, sizes, used))
-        runs, m, laws = own.look(bank)
-        gains, values, used = laws.best(m, m.K[:, m.error])
-        best = max(sizes, key=lambda i: gains[i])
-        _, beside, _ = laws.best(m, m.K[:, m.error] - m.K @ used[best])
-        sizes = {i: [values[i]] + [beside[i]] * (len(some) > 1) for i, some in sizes.items()}
-    runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, {i: used[i] for i in sizes})
+        look = own.look(own.with_best_sizes(look, sizes, used))
+        gains, values, used = look.laws.best(look.metric)
+        _, beside = look.beside(used[max(sizes, key=lambda i: gains[i])])
+        sizes = {i: [float(v[i][0]) for v in (values, beside)[: len(some)]] for i, some in sizes.items()}
+    # Close look: alone and in pairs, each with the discrepancy of its law.
+    runs, extra = products_with_discrepancy(
+        evidence.runs, evidence.model, look.bank, {i: used[i] for i in sizes}
+    )
     weight, before, normal = np.ones(len(evidence.channels)), np.zeros(0), own.reference_energies()
     for _ in range(ROUNDS):
         m = own.metric(runs, weight)
-        laws = Laws.of(evidence.candidates, bank.ladders, m.shared, m.none)
+        laws = Laws.of(evidence.candidates, look.bank.ladders(), m.shared, m.none)
         found = CloseLook(m, laws, tuple(sizes), extra).search()
         top = max(found, key=lambda laws: found[laws].evidence - 5.0 * len(laws))
         before, weight = weight, own.weights(runs, found[top], weight, normal)
         if np.allclose(before, weight, rtol=0.1):
             break
-    chance = ReferenceGains.of(
-        evidence, sigma, robot, before, laws, {i: found[i,] for i in sizes}, laws.planes
-    )
+    # Less what the same laws gain on references.
+    singles = {i: found[i,] for i in sizes}
+    chance = ReferenceGains.of(evidence, sigma, robot, before, laws, singles, laws.planes)
     found = {
         some: dataclasses.replace(fit, evidence=fit.evidence - chance.most(some))
         for some, fit in found.items()
@@ -249,13 +264,11 @@ def _by_effect(
     """Sets of laws by their effects: forms are alternatives of equal weight. Laws without a close look are as
     far behind the best as at first look, or further."""
     close = {i for some in found for i in some}
-    best = max((found[i,] for i in close), key=lambda fit: fit.evidence)
-    worst = min(alone[i].evidence for i in close)
+    worst, lowest = min(alone[i].evidence for i in close), min(found[i,].evidence for i in close)
     every = dict(found)
     for i in alone.keys() - close:
         behind = max(worst - alone[i].evidence, 0.0)
-        lowest = min(found[k,].evidence for k in close)
-        every[i,] = dataclasses.replace(alone[i], evidence=min(lowest, best.evidence) - behind)
+        every[i,] = dataclasses.replace(alone[i], evidence=lowest - behind)
     groups = dict[Sets, list[Fitted]]()
     for some, fit in every.items():
         groups.setdefault(tuple(sorted(laws.names[i].effect for i in some)), []).append(fit)

@@ -93,13 +93,14 @@ class Laws:
             self, law=self.law[mine], column=self.column[mine], size=self.size[mine], planes=planes
         )
 
-    def best(self, m: Metric, rest: Array) -> tuple[Array, list[Array], list[Array]]:
-        """Every law alone at its best: gain of the log likelihood, values (k,) and coefficients (M + 1,).
+    def best(self, m: Metric, beside: Array | None = None) -> tuple[Array, list[Array], list[Array]]:
+        """Every law at its best: gain of the log likelihood, values (k,) and coefficients (M + 1,).
 
         Args:
-            rest: (M + 1,) inner products of the columns with what is to be explained.
+            beside: (M + 1,) coefficients of other laws, which explain a part of the error; None: none.
         """
         K, count = m.K, len(self.names)
+        rest = K[:, m.error] if beside is None else K[:, m.error] - K @ beside
         gains = np.full(count, -np.inf)
         values, used = [np.zeros(len(h.columns)) for h in self.names], [np.zeros(len(K))] * count
         a, b = self.column[:, 0], self.column[:, 1]
@@ -107,10 +108,8 @@ class Laws:
         square = np.maximum(K[b, b] - 2.0 * K[a, b] + K[a, a], 1e-9)
         t = np.clip(linear / square, 0.0, 1.0)
         gain = rest[a] - 0.5 * K[a, a] + linear * t - 0.5 * square * t * t
-        best = dict(
-            zip(self.law[np.argsort(gain, kind="stable")], np.argsort(gain, kind="stable"), strict=True)
-        )
-        for i, n in best.items():  # the best piece of each law comes last and stays
+        order = np.argsort(gain, kind="stable")
+        for i, n in dict(zip(self.law[order], order, strict=True)).items():  # the best piece of a law is last
             gains[i], values[i] = gain[n], np.full(len(values[i]), self.size[n] @ (1.0 - t[n], t[n]))
             used[i] = np.zeros(len(K))
             np.add.at(used[i], self.column[n], (1.0 - t[n], t[n]))
@@ -130,7 +129,7 @@ class Laws:
         gain, total = -np.inf, np.zeros(len(K))
         for _ in range(SWEEPS if len(laws) > 1 else 1):
             for k, i in enumerate(laws):
-                _, v, w = part[k].best(m, K[:, e] - K @ (total - used[k]))
+                _, v, w = part[k].best(m, total - used[k])
                 total = total - used[k] + w[i]
                 used[k], values[k] = w[i], v[i]
             before, gain = gain, float(total @ K[:, e] - 0.5 * total @ K @ total)

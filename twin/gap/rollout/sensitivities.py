@@ -11,10 +11,10 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.twin.calibrate.log import PreparedLog, window_of
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned, aligned_start
+from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned_start, moved, rotated, window_index
 from terrafusion.twin.gap.data.samples import (
     COARSE_STEP,
     coarse_counts,
@@ -100,15 +100,18 @@ def aligned_predictions(
     World-fixed effects are simulated again from the aligned poses: a robot that slides down a slope does not
     point along its track.
     """
-    out = predictions(rollouts, model, candidates, jobs)
-    again = dict[int, Rollout]()
+    done, out = list(rollouts), predictions(rollouts, model, candidates, jobs)
+    again = list[int]()
     for i, (rollout, y) in enumerate(zip(rollouts, out, strict=True)):
         if y is not None and candidates.any_world_fixed({**model.effects, **rollout.effects}):
-            start = aligned_start(rollout.log, y, rollout.poses())
-            again[i] = dataclasses.replace(rollout, start=start)
-    for i, y in zip(again, predictions(list(again.values()), model, candidates, jobs), strict=True):
+            done[i] = dataclasses.replace(rollout, start=aligned_start(rollout.log, y, rollout.poses()))
+            again.append(i)
+    for i, y in zip(again, predictions([done[i] for i in again], model, candidates, jobs), strict=True):
         out[i] = y
-    return [None if y is None else aligned(r.log, y) for r, y in zip(rollouts, out, strict=True)]
+    return [
+        None if y is None else moved(r.log, y, r.poses(), aligned_start(r.log, y, r.poses()))
+        for r, y in zip(done, out, strict=True)
+    ]
 
 
 def predictions(
@@ -239,33 +242,21 @@ def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitiv
 
 
 def moved_to(log: PreparedLog, channels: Sequence[Sensitivity], old: Array, new: Array) -> list[Sensitivity]:
-    """Sensitivities from other poses (W, 3) at the windows' starts than the old ones: on a level plane the
-    run shifts and turns as a whole."""
+    """Sensitivities from other poses (W, 3) at the windows' starts than the old ones, see `poses.moved`."""
     if np.array_equal(old, new):
         return list(channels)
-    at, out = {o.channel: i for i, o in enumerate(log.observed)}, list(channels)
-    window = [np.clip(window_of(o, log.windows), 0, len(log.windows) - 1) for o in log.observed]
     turn = new[:, 2] - old[:, 2]
-    for pair in EAST_NORTH:
-        if not all(channel in at for channel in pair):
-            continue
-        east, north = (at[channel] for channel in pair)
-        k = window[east]
-        origins = (old[k, :2], new[k, :2]) if pair == EAST_NORTH[0] else (np.zeros((1, 2)), np.zeros((1, 2)))
-        cos, sin = np.cos(turn[k]), np.sin(turn[k])
-        a, b = channels[east], channels[north]
-        x, y = a.value - origins[0][:, 0], b.value - origins[0][:, 1]
-        for i, s, (p, q), origin in (
-            (east, a, (cos, -sin), origins[1][:, 0]), (north, b, (sin, cos), origins[1][:, 1])
-        ):  # fmt: skip
-            by_pose = s.by_pose.copy()  # the derivatives by x and y do not depend on the pose
-            by_pose[:, 2] = p * a.by_pose[:, 2] + q * b.by_pose[:, 2]
-            by_effect, by_patch = (
-                p[:, None] * one + q[:, None] * other
-                for one, other in ((a.by_effect, b.by_effect), (a.by_patch, b.by_patch))
-            )
-            out[i] = Sensitivity(p * x + q * y + origin, by_effect, by_patch, by_pose, s.heading)
-    return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, window, strict=True)]
+    value = moved(log, [s.value for s in channels], old, new)
+    by_effect, by_patch, by_pose = (
+        rotated(log, [getattr(s, name) for s in channels], turn)
+        for name in ("by_effect", "by_patch", "by_pose")
+    )
+    out = []
+    for i, s in enumerate(channels):
+        by_pose[i] = np.column_stack([s.by_pose[:, :2], by_pose[i][:, 2]])  # of x and y, whatever the pose
+        heading = s.heading + turn[window_index(log, i)]
+        out.append(Sensitivity(value[i], by_effect[i], by_patch[i], by_pose[i], heading))
+    return out
 
 
 def _channel(outputs: Array, channel: str) -> Array:

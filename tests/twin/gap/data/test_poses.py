@@ -12,7 +12,7 @@ from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared, starting_model
-from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned, aligned_start, alignment_angles
+from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned_start, alignment_angles, moved
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import run
@@ -46,7 +46,8 @@ def test_a_turned_and_shifted_track_is_laid_back(recording: Recording) -> None:
     log, _ = log_of(recording)
     wrong = turned(log, 0.8, 3.0)
     assert alignment_angles(log, wrong) == pytest.approx(-0.8, abs=0.01)
-    for now, then, observed in zip(aligned(log, wrong), wrong, log.observed, strict=True):
+    laid_back = moved(log, wrong, log.start, aligned_start(log, wrong, log.start))
+    for now, then, observed in zip(laid_back, wrong, log.observed, strict=True):
         if observed.channel.startswith("gnss"):
             spread = float(np.std(observed.value))
             assert np.abs(now - observed.value).max() < 0.02 * spread + 0.02
