@@ -60,16 +60,18 @@ def level_factor(k: int) -> gtsam.NonlinearFactor:
 
 
 def with_centripetal_force(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
-    """The segments with the specific force of a level robot at constant forward speed."""
-    speed = before.forward_mps
+    """The segments with the specific force of a level robot in a steady turn, sliding or not.
+
+    It is perpendicular to the velocity: a force along it would speed up a robot that slides sideways.
+    """
+    ahead, left = before.velocity @ before.rotation[:, :2]
     bias = float(before.bias.gyroscope()[2])
-    return [
-        dataclasses.replace(
-            segment,
-            accel_mps2=np.array([0.0, speed * (float(segment.gyro_radps[2]) - bias), GRAVITY_MPS2]),
-        )
-        for segment in segments
-    ]
+    out = []
+    for segment in segments:
+        rate = float(segment.gyro_radps[2]) - bias
+        force = np.array([-rate * left, rate * ahead, GRAVITY_MPS2])
+        out.append(dataclasses.replace(segment, accel_mps2=force))
+    return out
 
 
 def with_wheel_acceleration(segments: list[ImuSegment], accel_mps2: float) -> list[ImuSegment]:
@@ -78,7 +80,7 @@ def with_wheel_acceleration(segments: list[ImuSegment], accel_mps2: float) -> li
     return [
         dataclasses.replace(
             segment,
-            accel_mps2=np.array([accel_mps2, *segment.accel_mps2[1:]]),
+            accel_mps2=segment.accel_mps2 + np.array([accel_mps2, 0.0, 0.0]),
             accel_density_mps2=(density, density),
         )
         for segment in segments

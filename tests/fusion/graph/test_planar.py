@@ -11,6 +11,8 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import ConfigError, DataError
@@ -259,14 +261,33 @@ def test_yaw_rate_of_the_wheels() -> None:
     assert np.isnan(rate[:2]).all()
 
 
-def test_a_turn_adds_the_centripetal_force() -> None:
+def _level_robot(ahead_mps: float, left_mps: float, bias_radps: float = 0.0) -> KeyState:
     heading = gtsam.Rot3.Rz(1.0)
-    velocity = heading.matrix() @ np.array([2.0, 0.0, 0.0])
-    bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.1]))
-    before = KeyState(gtsam.Pose3(heading, np.zeros(3)), velocity, bias, np.zeros(len(LINEAR)))
+    velocity = heading.matrix() @ np.array([ahead_mps, left_mps, 0.0])
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, bias_radps]))
+    return KeyState(gtsam.Pose3(heading, np.zeros(3)), velocity, bias, np.zeros(len(LINEAR)))
+
+
+def test_a_turn_adds_the_centripetal_force() -> None:
     segment = ImuSegment(0.1, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, GRAVITY_MPS2]))
-    force = with_centripetal_force([segment], before)[0].accel_mps2
-    np.testing.assert_allclose(force, [0.0, 2.0 * 0.3, GRAVITY_MPS2])
+    force = with_centripetal_force([segment], _level_robot(2.0, 0.0, 0.1))[0].accel_mps2
+    np.testing.assert_allclose(force, [0.0, 2.0 * 0.3, GRAVITY_MPS2], atol=1e-12)
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(ahead=st.floats(-4.0, 4.0), left=st.floats(-4.0, 4.0), rate=st.floats(-2.5, 2.5))
+def test_a_turn_makes_no_energy(ahead: float, left: float, rate: float) -> None:
+    """A robot that slides sideways while it turns keeps its speed: two seconds of predictions."""
+    link = PlanarPreintegrator(load_vehicle("elevate").rig().sensors.imu, "gyro")
+    state, noise = _level_robot(ahead, left), load_policy().fixed
+    segments = [ImuSegment(2e-3, np.array([0.0, 0.0, rate]), np.array([0.0, 0.0, GRAVITY_MPS2]))] * 50
+    for _ in range(20):
+        now = gtsam.NavState(state.pose, state.velocity)
+        nav = link.integrate(with_centripetal_force(segments, state), state.bias, noise).predict(
+            now, state.bias
+        )
+        state = dataclasses.replace(state, pose=nav.pose(), velocity=nav.velocity())
+    assert np.linalg.norm(state.velocity) == pytest.approx(np.hypot(ahead, left), rel=0.02, abs=1e-9)
 
 
 def test_the_link_goes_round_a_circle_and_comes_back() -> None:
