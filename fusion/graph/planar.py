@@ -2,10 +2,10 @@
 
 It is the preintegrated factor of the full graph, fed with the readings of a robot on level ground: yaw
 rate from the gyro's z axis or from the wheels, no roll or pitch rate, the specific force of a steady turn
-(rate times speed, perpendicular to the velocity), gravity upwards. Its noise: the yaw rate has that of its source, speed is a random walk
-(white acceleration; Bar-Shalom, Li and Kirubarajan 2001, sec. 6.2.2), roll and pitch are held level by an
-attitude factor. They and the accelerometer's bias are not estimated. Height follows GNSS, or stays at its
-start.
+(rate times speed, perpendicular to the velocity), gravity upwards. Its noise: the yaw rate has that of its
+source, speed is a random walk (white acceleration; Bar-Shalom, Li and Kirubarajan 2001, sec. 6.2.2),
+roll and pitch are held level by an attitude factor. They and the accelerometer's bias are not estimated.
+Height follows GNSS, or stays at its start.
 """
 
 import dataclasses
