@@ -190,10 +190,8 @@ def explain(
     alone = own.alone(look)
     if not close:
         one: dict[tuple[int, ...], Fitted] = {(i,): fit for i, fit in alone.items()}
-        runs = len(evidence.runs)
-        return _by_effect(
-            one, alone, look.laws, own.outside(look.metric), {}, lambda fit: [fit.values] * runs
-        )
+        count, outside = len(evidence.runs), own.outside(look.metric)
+        return _by_effect(one, alone, look.laws, outside, {}, lambda fit: [fit.values] * count)
     # Second look: the twin simulated at the sizes of the first.
     look = own.look(own.with_first_sizes(look, own.promising(look, alone, SECOND)))
     alone = own.alone(look)
