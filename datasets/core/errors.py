@@ -73,6 +73,5 @@ def errors_of(file: str | Path) -> Iterator[None]:
     except DataError as error:
         if error.file is not None:
             raise
-        raise DataError(
-            error.what, file=file, channel=error.channel, time_s=error.time_s, remedy=error.remedy
-        ) from None
+        kind, channel, time_s = type(error), error.channel, error.time_s
+        raise kind(error.what, file=file, channel=channel, time_s=time_s, remedy=error.remedy) from None

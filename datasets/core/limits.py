@@ -5,8 +5,6 @@ unpack to any amount. They leave room for an IMU of 400 Hz for three hours.
 """
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
-from typing import Any
 
 from terrafusion.datasets.core.errors import DataError
 
@@ -40,51 +38,46 @@ PICKLE_BYTES, PICKLE_CELLS = 32 * 2**20, 20_000_000
 """Two hours of a published log have 32 MiB and 370 000 cells."""
 
 
-def too_much(file: Path | str, what: str, most: float, remedy: str = "split it", **place: Any) -> DataError:
-    """The error that a file has more than `most` of something.
-
-    Args:
-        what: what is counted, such as "rows".
-        place: the channel, where known.
-    """
-    return DataError(f"has more than {most:,.0f} {what}".replace(",", " "), file=file, remedy=remedy, **place)
+def too_much(what: str, most: float, remedy: str = "split it") -> DataError:
+    """The error that a file has more than `most` of something, such as "rows"."""
+    return DataError(f"has more than {most:,.0f} {what}".replace(",", " "), remedy=remedy)
 
 
-def check_table(file: Path | str, rows: int, columns: int, packed_bytes: int) -> None:
+def check_table(rows: int, columns: int, packed_bytes: int) -> None:
     """Refuse a table of too many rows, columns or values, or far more of them than its bytes account for.
 
     Raises:
         DataError: it is too large.
     """
-    check_columns(file, columns)
+    check_columns(columns)
     if rows > ROWS:
-        raise too_much(file, "rows", ROWS)
+        raise too_much("rows", ROWS)
     if rows * columns > VALUES:
-        raise too_much(file, "values", VALUES)
-    check_expansion(file, 8 * rows * columns, packed_bytes)
+        raise too_much("values", VALUES)
+    check_expansion(8 * rows * columns, packed_bytes)
 
 
-def check_columns(file: Path | str, columns: int) -> None:
+def check_columns(columns: int) -> None:
     """Refuse a table of too many columns.
 
     Raises:
         DataError: it has.
     """
     if columns > COLUMNS:
-        raise too_much(file, "columns", COLUMNS, "keep those that are needed")
+        raise too_much("columns", COLUMNS, "keep those that are needed")
 
 
-def check_expansion(file: Path | str, unpacked_bytes: int, packed_bytes: int) -> None:
+def check_expansion(unpacked_bytes: int, packed_bytes: int) -> None:
     """Refuse a file that unpacks to far more bytes than it has.
 
     Raises:
         DataError: it does.
     """
     if unpacked_bytes > FREE_BYTES + EXPANSION * packed_bytes:
-        raise too_much(file, "times its size when unpacked", EXPANSION, "is it a recording?")
+        raise too_much("times its size when unpacked", EXPANSION, "is it a recording?")
 
 
-def within(file: Path | str, parts: Iterable[bytes], packed_bytes: int) -> Iterator[bytes]:
+def within(parts: Iterable[bytes], packed_bytes: int) -> Iterator[bytes]:
     """The unpacked parts of a file, as long as they are not far more bytes than it has.
 
     Raises:
@@ -93,7 +86,7 @@ def within(file: Path | str, parts: Iterable[bytes], packed_bytes: int) -> Itera
     total = 0
     for part in parts:
         total += len(part)
-        check_expansion(file, total, packed_bytes)
+        check_expansion(total, packed_bytes)
         yield part
 
 

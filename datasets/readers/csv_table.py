@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.errors import ClockError, DataError
+from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
 
@@ -74,24 +74,29 @@ def read_table(
             finite number, a line with too few or too many cells, a time that is missing
             or looks like Unix time. The message names file, column, line and time.
     """
+    with errors_of(path):
+        return _read(path, [*known], texts, prefixes, in_order=in_order)
+
+
+def _read(
+    path: Path, known: list[str], texts: Sequence[str], prefixes: Sequence[str], *, in_order: bool
+) -> CsvTable:
     data = read_text(path)
-    header = _header(path, data, [*known], texts, prefixes)
+    header = _header(data, known, texts, prefixes)
     layout = TextLayout(tuple(header), ",", 2, time="t_s", strict=True)
     words = [name for name in header if name in texts]
     table = read_columns(path, data, layout, [n for n in header if n not in (*words, "t_s")], ["t_s", *words])
     t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
-    _check_times(path, t_ns, in_order=in_order)
+    _check_times(t_ns, in_order=in_order)
     return CsvTable(t_ns, table.numbers, {name: table.texts[name] for name in words}, table.notes)
 
 
-def _header(
-    path: Path, data: bytes, known: list[str], texts: Sequence[str], prefixes: Sequence[str]
-) -> list[str]:
+def _header(data: bytes, known: list[str], texts: Sequence[str], prefixes: Sequence[str]) -> list[str]:
     try:
         header = [name.strip() for name in next(csv.reader([data.split(b"\n", 1)[0].decode()]), [])]
     except csv.Error as error:
-        raise not_a_table(path, 1, error) from None
-    limits.check_columns(path, len(header))
+        raise not_a_table(1, error) from None
+    limits.check_columns(len(header))
     allowed = ["t_s", *known, *texts]
     for name in header:
         if name in allowed or any(name.startswith(p) and name != p for p in prefixes):
@@ -99,12 +104,12 @@ def _header(
         close = difflib.get_close_matches(name[:100], allowed, n=1)
         meant = f"did you mean '{close[0]}'? " if close else ""
         listed = ", ".join([*allowed, *(f"{p}<name>" for p in prefixes)])
-        raise DataError(f"unknown column '{shown(name)}'", file=path, remedy=f"{meant}allowed: {listed}")
+        raise DataError(f"unknown column '{shown(name)}'", remedy=f"{meant}allowed: {listed}")
     repeated = limits.repeated(header)
     if repeated:
-        raise DataError(f"column '{shown(repeated)}' comes twice", file=path, remedy="keep one of them")
+        raise DataError(f"column '{shown(repeated)}' comes twice", remedy="keep one of them")
     if "t_s" not in header:
-        raise DataError("column 't_s' is missing", file=path, remedy="add it: seconds from start_ns")
+        raise DataError("column 't_s' is missing", remedy="add it: seconds from start_ns")
     return header
 
 
@@ -113,12 +118,11 @@ def read_times(path: Path) -> NDArray[np.int64]:
     return read_table(path, (), texts=("fix", "label"), prefixes=("",), in_order=False).t_ns
 
 
-def _check_times(path: Path, t_ns: NDArray[np.int64], *, in_order: bool) -> None:
+def _check_times(t_ns: NDArray[np.int64], *, in_order: bool) -> None:
     far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
     if far.size:
         raise DataError(
             f"t_s is {t_ns[far[0]] * 1e-9:.9g}, which looks like Unix time",
-            file=path,
             remedy="t_s must be seconds from start_ns of meta.yaml",
         )
     back = np.flatnonzero(np.diff(t_ns) < 0)
@@ -126,7 +130,6 @@ def _check_times(path: Path, t_ns: NDArray[np.int64], *, in_order: bool) -> None
         i = int(back[0])
         raise ClockError(
             f"time runs backwards from {t_ns[i] * 1e-9:.9f} to {t_ns[i + 1] * 1e-9:.9f} s at row {i + 2}",
-            file=path,
             channel="t_s",
             time_s=float(t_ns[i]) * 1e-9,
             remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",

@@ -100,10 +100,10 @@ class TextTable:
 
     def bad_cell(self, name: str, row: int, remedy: str) -> DataError:
         """The error for column `name` of data row `row` (from 0)."""
-        line, cells = next(islice(_rows(self.path, self.data, self.layout), row, None), (0, []))
+        line, cells = next(islice(_rows(self.data, self.layout), row, None), (0, []))
         cell = dict(zip(self.layout.names, cells, strict=False)).get(name, "")
         what = f"line {line} has no '{name}'" if not cell.strip() else _cell_is(name, cell, line)
-        return _line_error(self.path, self.data, self.layout, what, cells, remedy)
+        return _line_error(self.data, self.layout, what, cells, remedy)
 
 
 def read_text(path: Path) -> bytes:
@@ -118,31 +118,31 @@ def read_text(path: Path) -> bytes:
             data = file.read(min(limits.FREE_BYTES + limits.EXPANSION * packed, limits.TEXT_BYTES) + 1)
     except (OSError, EOFError, zlib.error) as error:
         what = f"cannot be read: {getattr(error, 'strerror', '') or error}"
-        raise DataError(what, file=path, remedy="is it complete?") from None
-    _check_size(path, data, packed)
+        raise DataError(what, remedy="is it complete?") from None
+    _check_size(data, packed)
     data = data.removeprefix(BOM)
     if not data or data.isspace():
-        raise DataError("the file is empty", file=path, remedy="copy it again; a table has at least a header")
+        raise DataError("the file is empty", remedy="copy it again; a table has at least a header")
     try:
         data.isascii() or data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise DataError(f"not UTF-8 at byte {error.start}", file=path, remedy="save it as UTF-8") from None
+        raise DataError(f"not UTF-8 at byte {error.start}", remedy="save it as UTF-8") from None
     if b"\0" in data:
-        raise DataError("holds zero bytes: not a text file", file=path, remedy="copy it again")
+        raise DataError("holds zero bytes: not a text file", remedy="copy it again")
     return data
 
 
-def _check_size(path: Path, data: bytes, packed: int) -> None:
+def _check_size(data: bytes, packed: int) -> None:
     """Refuse more bytes, rows or bytes in a line than a text file may have."""
     if len(data) > limits.TEXT_BYTES:
-        raise limits.too_much(path, "MB", limits.TEXT_BYTES / 2**20, "split it, or convert it to Parquet")
-    limits.check_expansion(path, len(data), packed)
+        raise limits.too_much("MB", limits.TEXT_BYTES / 2**20, "split it, or convert it to Parquet")
+    limits.check_expansion(len(data), packed)
     if max(data.count(b"\n"), data.count(b"\r")) > limits.ROWS:
-        raise limits.too_much(path, "lines", limits.ROWS)
-    check_lines(path, data)
+        raise limits.too_much("lines", limits.ROWS)
+    check_lines(data)
 
 
-def check_lines(path: Path, data: bytes) -> None:
+def check_lines(data: bytes) -> None:
     """Refuse a line that is too long for one.
 
     Raises:
@@ -153,7 +153,7 @@ def check_lines(path: Path, data: bytes) -> None:
         end = data.rfind(b"\n", begin, begin + limits.LINE_BYTES) + 1
         if not end:
             line = data.count(b"\n", 0, begin) + 1
-            raise limits.too_much(path, f"bytes in line {line}", limits.LINE_BYTES, "is it a text file?")
+            raise limits.too_much(f"bytes in line {line}", limits.LINE_BYTES, "is it a text file?")
         begin = end
 
 
@@ -200,20 +200,20 @@ def read_columns(
     """
     end, notes = _complete_end(path, data, layout)
     data = data[:end]
-    limits.check_columns(path, len(layout.names))
+    limits.check_columns(len(layout.names))
     if data.count(b"\n") * (len(numbers) + len(texts)) > limits.VALUES:
-        raise limits.too_much(path, "values", limits.VALUES)
-    _check_counts(path, data, layout)
+        raise limits.too_much("values", limits.VALUES)
+    _check_counts(data, layout)
     table = _parse(data, layout, numbers, texts)
     if table is None or _is_suspect(table, data, layout, numbers):
-        _check_cells(path, data, layout, set(numbers))
+        _check_cells(data, layout, set(numbers))
     if table is None:
-        raise DataError("cannot be read as a table", file=path, remedy="write plain separated numbers")
+        raise DataError("cannot be read as a table", remedy="write plain separated numbers")
     columns = TextTable(
         path, layout, data, {n: table[n] for n in numbers}, {n: table[n] for n in texts}, notes
     )
     if not len(columns) and not layout.strict:
-        raise DataError("holds a header but no rows", file=path, remedy="record or copy it again")
+        raise DataError("holds a header but no rows", remedy="record or copy it again")
     return columns
 
 
@@ -230,28 +230,26 @@ def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tup
     return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
 
 
-def _check_counts(path: Path, data: bytes, layout: TextLayout) -> None:
+def _check_counts(data: bytes, layout: TextLayout) -> None:
     """Refuse the first line that has not as many cells as there are columns."""
     quoted = layout.separator != BLANKS and b'"' in data
-    for line, text, count in _quoted_misfits(path, data, layout) if quoted else _misfits(data, layout):
+    for line, text, count in _quoted_misfits(data, layout) if quoted else _misfits(data, layout):
         if line < layout.first_line or not text.strip() or (layout.comment and text[0] == layout.comment):
             continue
         what = f"line {line} has {count} cells for {len(layout.names)} columns"
         cells, remedy = split(text, layout.separator), "is it cut off, or of another table?"
         if layout.strict:
             remedy = "an unknown value is an empty cell between commas"
-        raise _line_error(path, data, layout, what, cells, remedy)
+        raise _line_error(data, layout, what, cells, remedy)
 
 
-def _line_error(
-    path: Path, data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str
-) -> DataError:
+def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
-    first = [] if layout.strict or not layout.time else next(_rows(path, data, layout), (0, []))[1]
+    first = [] if layout.strict or not layout.time else next(_rows(data, layout), (0, []))[1]
     time_s = layout.seconds(cells)
     origin_s = 0.0 if layout.strict else layout.seconds(first)
     since_s = None if time_s is None or origin_s is None else time_s - origin_s
-    return DataError(what, file=path, time_s=since_s, remedy=remedy)
+    return DataError(what, time_s=since_s, remedy=remedy)
 
 
 def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
@@ -281,8 +279,8 @@ def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
         begin, line = end, line + len(ends)
 
 
-def _quoted_misfits(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    for line, cells in _rows(path, data, layout):
+def _quoted_misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
+    for line, cells in _rows(data, layout):
         if len(cells) != len(layout.names):
             yield line, layout.separator.join(cells) or ".", len(cells)
 
@@ -333,17 +331,17 @@ def _is_suspect(
     return any(word in lower for word in (b"nan", b", ", b" ,", b",\t", b"\t,"))
 
 
-def _check_cells(path: Path, data: bytes, layout: TextLayout, numbers: set[str]) -> None:
+def _check_cells(data: bytes, layout: TextLayout, numbers: set[str]) -> None:
     """Raise for the first cell of a numeric column that is neither finite nor missing."""
     remedy = "give a finite number, or leave the cell empty where the value is missing"
-    for line, cells in _rows(path, data, layout):
+    for line, cells in _rows(data, layout):
         for name, cell in zip(layout.names, cells, strict=False):
             missing = not cell if layout.strict else cell.strip() in MISSING
             if name in numbers and not missing and not _is_finite(cell):
-                raise _line_error(path, data, layout, _cell_is(name, cell, line), cells, remedy)
+                raise _line_error(data, layout, _cell_is(name, cell, line), cells, remedy)
 
 
-def _rows(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
+def _rows(data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every row."""
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", newline="")
     if layout.separator == BLANKS:
@@ -362,13 +360,13 @@ def _rows(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, li
             if len(cells) > 1 or "".join(cells).strip():
                 yield at - 1, cells
     except csv.Error as error:
-        raise not_a_table(path, at, error) from None
+        raise not_a_table(at, error) from None
 
 
-def not_a_table(path: Path, line: int, error: csv.Error) -> DataError:
+def not_a_table(line: int, error: csv.Error) -> DataError:
     """The error for a line that the csv module refuses."""
     what = f"line {line} is not a line of a table: {error}"
-    return DataError(what, file=path, remedy="write plain separated numbers, without quotes")
+    return DataError(what, remedy="write plain separated numbers, without quotes")
 
 
 def _is_finite(cell: str) -> bool:

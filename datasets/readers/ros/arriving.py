@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.errors import errors_of
 from terrafusion.datasets.core.messages import Message
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics
@@ -31,7 +32,7 @@ KINDS = ("imu", "wheels", "gnss", "gnss_velocity", "command", "barometer", "stee
 """Channels that an estimator takes live."""
 DEFINITIONS = {
     topics.ACKERMANN: "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
-    "float32 acceleration\nfloat32 jerk\n",
+    "float32 acceleration\nfloat32 jerk\n"
 }
 DEFINITIONS[topics.ACKERMANN_STAMPED] = (
     "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
@@ -145,7 +146,7 @@ class ArrivingMessages:
         for kind, topic in self.chosen.items():
             if (topic.name, topic.msgtype) == (message.topic, message.msgtype):
                 stream = self._stream(kind, message)
-                with foreign(message.topic):
+                with errors_of(LIVE), foreign(message.topic):
                     for sample in self._samples(kind, stream, self._time_of(stream), message):
                         t_ns = sample.t_ns[0] if isinstance(sample, Gnss) else sample.t_ns
                         found.append((int(t_ns), kind, sample))
@@ -156,7 +157,7 @@ class ArrivingMessages:
         chosen = dict(self.chosen)
         asked = {kind: one.name for kind, one in chosen.items()}
         new = topics.BagTopic(topic, msgtype, 1)
-        found, _ = topics.choose_topics([*chosen.values(), new], file=LIVE, user=asked)
+        found, _ = topics.choose_topics([*chosen.values(), new], user=asked)
         for kind, one in found.items():
             if kind in ("gnss", "gnss_velocity", "command", "barometer") and kind not in chosen:
                 self.chosen[kind] = one

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers.formats import Request
@@ -50,36 +50,34 @@ def opened_bag(
     Raises:
         DataError: a broken bag, also where that shows only while it is read.
     """
-    try:
-        with foreign():
-            container = open_container(path)
-        with closing(container):
-            yield container
-    except BagError as error:
-        what = f"cannot be read as a ROS bag: {str(error)[:MOST_TEXT]}"
-        raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
+    with errors_of(path):
+        try:
+            with foreign():
+                container = open_container(path)
+            with closing(container):
+                yield container
+        except BagError as error:
+            what = f"cannot be read as a ROS bag: {str(error)[:MOST_TEXT]}"
+            raise DataError(what, channel=error.topic, remedy=remedy) from None
 
 
 def chosen_topics(
-    container: BagContainer,
-    request: Request,
-    decide: Callable[[str, list[BagTopic]], BagTopic] | None = None,
+    container: BagContainer, request: Request, decide: Callable[[str, list[BagTopic]], BagTopic] | None = None
 ) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes; raises as `choose_topics` does.
 
     `decide` is asked about several sensors of one kind with data; without it they are an error.
     """
-    path, rig = request.path, request.rig
-    joints = joints_given(request.topics)
-    return choose_topics(
-        topics_of(container),
-        file=path,
-        user=request.topics,
-        usual=rig.topics if rig else None,
-        is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
-        one_of=functools.partial(_one_sensor, container, path, rig, decide),
-        is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
-    )
+    rig, joints = request.rig, joints_given(request.topics)
+    with errors_of(request.path):
+        return choose_topics(
+            topics_of(container),
+            user=request.topics,
+            usual=rig.topics if rig else None,
+            is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
+            one_of=functools.partial(_one_sensor, container, rig, decide),
+            is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
+        )
 
 
 def recording_of(container: BagContainer, request: Request) -> Recording:
@@ -88,6 +86,11 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
     Raises:
         DataError, BagError: no usable topic, or what the channels refuse.
     """
+    with errors_of(request.path):
+        return _recording(container, request)
+
+
+def _recording(container: BagContainer, request: Request) -> Recording:
     path, rig = request.path, request.rig
     there = {(source.topic, source.msgtype) for source in container.sources if source.count}
     if META in there and not request.topics and request.stamps == "header":
@@ -105,11 +108,10 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
         seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics_of(container)) or "none"
         raise DataError(
             f"no topic of a type this library uses; topics here: {seen}",
-            file=path,
             remedy="name one with --topic, such as --topic imu=/imu/data",
         )
     datum = streams.pop("datum", None)
-    timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock, file=path)
+    timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
     start_ns = min(int(t[0]) for t in timing.times.values())
     joints = joints_given(request.topics)
     builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
@@ -175,7 +177,6 @@ def _joints(container: BagContainer, topic: str) -> list[str]:
 
 def _one_sensor(
     container: BagContainer,
-    path: Path,
     rig: Rig | None,
     decide: Callable[[str, list[BagTopic]], BagTopic] | None,
     kind: str,
@@ -200,7 +201,6 @@ def _one_sensor(
     listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in candidates)
     raise DataError(
         f"{len(candidates)} sensors of one kind: {listed}",
-        file=path,
         channel=kind,
         remedy=f"choose with --topic {kind}={candidates[0].name} (or topics={{'{kind}': ...}} in Python)",
     )

@@ -175,7 +175,6 @@ class ChannelBuilder:
         if not joints:
             raise DataError(
                 f"joints {', '.join(names) or '(none)'} name no wheels",
-                file=self.file,
                 channel=stream.topic,
                 remedy="name them with --topic joint.left=NAME --topic joint.right=NAME",
             )
@@ -183,7 +182,6 @@ class ChannelBuilder:
         if not held.any():
             raise DataError(
                 f"no message holds all of the joints {', '.join(joints.values())}",
-                file=self.file,
                 channel=stream.topic,
                 remedy="name the wheel joints with --topic joint.left=NAME --topic joint.right=NAME",
             )
@@ -202,7 +200,7 @@ class ChannelBuilder:
                 f"wheels: {stream.topic} has no velocities; taken from differences of the angles"
             )
         if speed is None:
-            raise DataError("joints have neither velocity nor position", file=self.file, channel=stream.topic)
+            raise DataError("joints have neither velocity nor position", channel=stream.topic)
         self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
         return Wheels(t_ns, speed, tuple(joints), "radps", angle)
 
@@ -227,7 +225,6 @@ class ChannelBuilder:
             return Steering(t_ns[held], angles, names)
         raise DataError(
             f"joints {', '.join(joint_names(stream)) or '(none)'} name no steering axis",
-            file=self.file,
             channel=stream.topic,
             remedy="name another topic with --topic steering=TOPIC",
         )
@@ -240,7 +237,7 @@ class ChannelBuilder:
             fix[status == number] = fix_class
         fixes = Fixes(t_ns, self._llh(stream), fix, np.full((len(stream), 3), np.nan))
         rows = f"messages of {stream.topic}"
-        held, enu, datum, notes = located(self.file, fixes, datum, channel=stream.topic, rows=rows)
+        held, enu, datum, notes = located(fixes, datum, channel=stream.topic, rows=rows)
         self.notes += notes
         if not held.any():
             return None, datum
@@ -344,7 +341,6 @@ class ChannelBuilder:
             i = int(np.flatnonzero(bad)[0])
             raise DataError(
                 f"{int(bad.sum())} of {len(values)} messages have a {what} that is not a finite number",
-                file=self.file,
                 channel=topic,
                 time_s=self._since(t_ns[i]),
                 remedy="correct the driver, or filter these messages out of the bag",

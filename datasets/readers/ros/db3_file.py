@@ -87,7 +87,7 @@ class Db3File:
             known = LANGUAGES.get(language, "msg")
             count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
             if len(sources) >= limits.TOPICS:
-                raise limits.too_much(self._path, "topics", limits.TOPICS)
+                raise limits.too_much("topics", limits.TOPICS)
             sources.append(
                 BagSource(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
             )
@@ -105,7 +105,7 @@ class Db3File:
             sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
             starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
             unpacked += int(sizes.sum())
-            limits.check_expansion(self._path, unpacked, self._bytes)
+            limits.check_expansion(unpacked, self._bytes)
             data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
             for group, mine in grouped(ids, wanted):
                 yield MessageBatch(group, data, starts[mine], sizes[mine], receipt_ns[mine])

@@ -115,12 +115,10 @@ def _parse(stream: Stream, file: Path) -> SavedChannels:
         if not 0 <= int(shift_ns) < 2**62:
             raise ValueError("not a time")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError):
-        raise DataError(
-            "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
-        ) from None
+        raise DataError("is not what this library writes", channel=META[0], remedy=REMEDY) from None
     meta = parse_meta(content, file)
     if meta.metadata:
-        raise DataError(f"unknown keys {', '.join(meta.metadata)}", file=file, channel=META[0], remedy=REMEDY)
+        raise DataError(f"unknown keys {', '.join(meta.metadata)}", channel=META[0], remedy=REMEDY)
     meta = dataclasses.replace(meta, keep_empty=True, metadata=metadata)
     return SavedChannels(meta, tables, words, int(shift_ns))
 
@@ -178,4 +176,4 @@ class _BagTables:
         return np.array([*words, None], dtype=object)[codes.astype(np.int64)]
 
     def _error(self, channel: str, what: str) -> DataError:
-        return DataError(f"the table has {what}", file=self.file, channel=f"{PREFIX}{channel}", remedy=REMEDY)
+        return DataError(f"the table has {what}", channel=f"{PREFIX}{channel}", remedy=REMEDY)

@@ -179,7 +179,7 @@ class McapFile:
             for chunk in self._chunks
             if not (wanted and chunk.channels) or not all(chunk.channels.isdisjoint(ids) for ids in wanted)
         )
-        return limits.within(self._path, chunks, self._end)
+        return limits.within(chunks, self._end)
 
     def _unpack(self, place: _ChunkPlace) -> bytes:
         chunk = Chunk.read(ReadDataStream(BytesIO(self._read(place.start, place.size))))

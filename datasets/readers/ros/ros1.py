@@ -148,7 +148,7 @@ class Ros1File:
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of connections, chunk by chunk."""
-        for data in limits.within(self._path, self._unpacked(wanted), self._end):
+        for data in limits.within(self._unpacked(wanted), self._end):
             yield from _messages(data, wanted)
 
     def _unpacked(self, wanted: Groups) -> Iterator[bytes]:

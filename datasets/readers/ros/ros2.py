@@ -118,7 +118,7 @@ class Ros2Folder:
         target = self._scratch.enter_context(scratch_folder()) / path.stem
         with zstd().open(path, "rb") as packed, target.open("wb") as out:
             blocks = iter(lambda: packed.read(1 << 20), b"")
-            for block in limits.within(path, blocks, path.stat().st_size):
+            for block in limits.within(blocks, path.stat().st_size):
                 out.write(block)
         return target
 
@@ -129,12 +129,12 @@ class Ros2Folder:
             here = [group for group, own in enumerate(mine) if own]
             for batch in file.batches([mine[group] for group in here]) if here else ():
                 found = batch._replace(group=here[batch.group])
-                yield _unpacked_messages(self._folder, found) if self._packed else found
+                yield _unpacked_messages(found) if self._packed else found
 
 
-def _unpacked_messages(folder: Path, batch: MessageBatch) -> MessageBatch:
+def _unpacked_messages(batch: MessageBatch) -> MessageBatch:
     """Messages that were compressed one by one."""
-    messages = list(limits.within(folder, _messages(batch), int(batch.sizes.sum())))
+    messages = list(limits.within(_messages(batch), int(batch.sizes.sum())))
     sizes = np.array([len(m) for m in messages], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     return batch._replace(data=np.frombuffer(b"".join(messages), dtype=np.uint8), starts=starts, sizes=sizes)

@@ -1,9 +1,7 @@
 """Times of a bag's messages: header stamps or receipt stamps, and the repair of clock steps."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +32,7 @@ class StreamTimes:
     jumps: tuple[ClockJump, ...] = ()
 
 
-def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool, file: Path) -> StreamTimes:
+def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool) -> StreamTimes:
     """Times of every stream on one clock.
 
     Header stamps are used unless `stamps` is "receipt", or they are all zero, or the topics'
@@ -53,13 +51,12 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool,
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
     received_jumps: tuple[ClockJump, ...] = ()
     if repair_clock:
-        with _errors_in(file):
-            receipt, received_jumps = repair_together(receipt)
+        receipt, received_jumps = repair_together(receipt)
     headed = _headed(timing, stamps)
-    headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock, file)
+    headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock)
     others = {kind: t for kind, t in receipt.items() if kind not in headed}
     for kind, t_ns in others.items():
-        _refuse_backwards(timing.streams[kind], t_ns, "receipt", REPAIR, file)
+        _refuse_backwards(timing.streams[kind], t_ns, "receipt", REPAIR)
     timing.times = headed | _onto(headed, receipt, others)
     timing.jumps = (*header_jumps, *(jump for jump in received_jumps if jump.channel in others))
     _sort(timing)
@@ -101,23 +98,20 @@ def _headed(timing: StreamTimes, stamps: str) -> Times:
 
 
 def _on_one_clock(
-    timing: StreamTimes, headed: Times, receipt: Times, repair_clock: bool, file: Path
+    timing: StreamTimes, headed: Times, receipt: Times, repair_clock: bool
 ) -> tuple[Times, tuple[ClockJump, ...]]:
     """Header stamps that can be used together, repaired where that is asked for; none where they differ."""
     if not headed:
         return {}, ()
     for kind, t_ns in headed.items():
-        _refuse_zeros(timing.streams[kind], t_ns, file)
+        _refuse_zeros(timing.streams[kind], t_ns)
         if not repair_clock:
-            in_time = in_order(receipt[kind]) is None
-            _refuse_backwards(
-                timing.streams[kind], t_ns, "header", f"{RECEIPT} or {REPAIR}" if in_time else REPAIR, file
-            )
+            remedy = f"{RECEIPT} or {REPAIR}" if in_order(receipt[kind]) is None else REPAIR
+            _refuse_backwards(timing.streams[kind], t_ns, "header", remedy)
     jumps: tuple[ClockJump, ...] = ()
     beside = {kind: receipt[kind] for kind, t in headed.items() if _same_rate(t, receipt[kind])}
     if repair_clock:
-        with _errors_in(file):
-            headed, jumps = repair_together(headed, beside=beside)
+        headed, jumps = repair_together(headed, beside=beside)
     else:
         timing.notes += _leaps(headed, beside)
     spread_s, far = _spread(headed, receipt)
@@ -129,15 +123,6 @@ def _on_one_clock(
         return {}, ()
     timing.notes.append(f"times are header stamps; {_latencies(timing, headed, receipt)}")
     return headed, jumps
-
-
-@contextmanager
-def _errors_in(file: Path) -> Iterator[None]:
-    """Errors that name the file too."""
-    try:
-        yield
-    except DataError as error:
-        raise DataError(error.what, file=file, channel=error.channel, remedy=error.remedy) from None
 
 
 def _leaps(headed: Times, beside: Times) -> list[str]:
@@ -154,25 +139,23 @@ def _leaps(headed: Times, beside: Times) -> list[str]:
     ]
 
 
-def _refuse_zeros(stream: Stream, header_ns: TimesNs, file: Path) -> None:
+def _refuse_zeros(stream: Stream, header_ns: TimesNs) -> None:
     zero = np.flatnonzero(header_ns == 0)
     if zero.size:
         raise DataError(
             f"{zero.size} of {len(stream)} header stamps are zero",
-            file=file,
             channel=stream.topic,
             time_s=_since(stream, int(zero[0])),
             remedy=RECEIPT,
         )
 
 
-def _refuse_backwards(stream: Stream, t_ns: TimesNs, which: str, remedy: str, file: Path) -> None:
+def _refuse_backwards(stream: Stream, t_ns: TimesNs, which: str, remedy: str) -> None:
     step = np.diff(t_ns)
     back = np.flatnonzero(step < 0)
     if back.size:
         raise DataError(
             f"{which} stamps run backwards by {-step[back[0]] * 1e-9:.6f} s",
-            file=file,
             channel=stream.topic,
             time_s=_since(stream, int(back[0]) + 1) if which == "header" else _since(stream, int(back[0])),
             remedy=remedy,

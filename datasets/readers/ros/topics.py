@@ -5,7 +5,6 @@ import functools
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from terrafusion.datasets.core.errors import DataError
 
@@ -87,7 +86,6 @@ class BagTopic:
 def choose_topics(
     bag: list[BagTopic],
     *,
-    file: Path,
     user: Mapping[str, str] | None = None,
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
@@ -113,9 +111,9 @@ def choose_topics(
     """
     chosen: dict[str, BagTopic] = {}
     notes: list[str] = []
-    for kind, name in _wanted(user or {}, file).items():
-        chosen[kind] = _asked_for(bag, kind, name, file)
-    for kind, name in _wanted(usual or {}, file).items():
+    for kind, name in _wanted(user or {}).items():
+        chosen[kind] = _asked_for(bag, kind, name)
+    for kind, name in _wanted(usual or {}).items():
         fits = [t for t in bag if t.name == name and t.msgtype in TYPES[kind]]
         if kind not in chosen and fits:
             chosen[kind] = fits[0]
@@ -155,7 +153,7 @@ def joints_given(user: Mapping[str, str] | None) -> dict[str, str]:
     return {key.removeprefix(JOINT_PREFIX): name for key, name in entries if key.startswith(JOINT_PREFIX)}
 
 
-def _wanted(topics: Mapping[str, str], file: Path) -> dict[str, str]:
+def _wanted(topics: Mapping[str, str]) -> dict[str, str]:
     wanted = {}
     for key, name in topics.items():
         if key.startswith(JOINT_PREFIX):
@@ -166,14 +164,13 @@ def _wanted(topics: Mapping[str, str], file: Path) -> dict[str, str]:
             meant = f"did you mean '{close[0]}'? " if close else ""
             raise DataError(
                 f"'{key}' is not a channel that a topic can be given for",
-                file=file,
                 remedy=f"{meant}known: {', '.join(TYPES)}",
             )
         wanted[kind] = name
     return wanted
 
 
-def _asked_for(bag: list[BagTopic], kind: str, name: str, file: Path) -> BagTopic:
+def _asked_for(bag: list[BagTopic], kind: str, name: str) -> BagTopic:
     named = [t for t in bag if t.name == name]
     fits = [t for t in named if t.msgtype in TYPES[kind]]
     if fits:
@@ -184,7 +181,7 @@ def _asked_for(bag: list[BagTopic], kind: str, name: str, file: Path) -> BagTopi
     else:
         what = f"no topic {name} with messages in this bag"
         remedy = f"topics here: {', '.join(f'{t.name} ({t.msgtype})' for t in bag) or 'none'}"
-    raise DataError(what, file=file, channel=kind, remedy=remedy)
+    raise DataError(what, channel=kind, remedy=remedy)
 
 
 def _is_fused(kind: str, topic: BagTopic) -> bool:

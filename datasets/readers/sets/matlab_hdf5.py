@@ -58,12 +58,10 @@ def opened(path: Path) -> Iterator[MatlabFile]:
     """
     try:
         with _file(path) as file:
-            yield MatlabFile(file, path)
+            yield MatlabFile(file)
     except _BROKEN as error:
         why = str(error).rpartition("(")[2].split("\n")[0].split(",")[0].rstrip(")")[:100]
-        raise DataError(
-            f"the HDF5 cannot be read: {why}", file=path, remedy="copy it again; is it complete?"
-        ) from None
+        raise DataError(f"the HDF5 cannot be read: {why}", remedy="copy it again; is it complete?") from None
 
 
 def _file(path: Path) -> Any:
@@ -75,8 +73,8 @@ def _file(path: Path) -> Any:
 class MatlabFile:
     """Variables of an open file by name."""
 
-    def __init__(self, file: Any, path: Path) -> None:
-        self._file, self._path = file, path
+    def __init__(self, file: Any) -> None:
+        self._file = file
 
     def has(self, name: str) -> bool:
         """Whether there is a variable of that name."""
@@ -120,7 +118,7 @@ class MatlabFile:
         return values
 
     def _wrong(self, name: str, what: str) -> DataError:
-        return DataError(what, file=self._path, channel=name, remedy="give the variable as it was published")
+        return DataError(what, channel=name, remedy="give the variable as it was published")
 
     def tables(self) -> Iterator[dict[str, Array]]:
         """Columns (N,) by name of every MATLAB `table` of numbers in the file.

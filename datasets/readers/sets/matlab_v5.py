@@ -67,12 +67,10 @@ def read_structures(path: Path, fields: set[str]) -> dict[str, list[Array]]:
                 return _values(payload, layout)
     except _BROKEN as error:
         raise DataError(
-            f"the MATLAB file cannot be read: {str(error)[:100]}", file=path, remedy="copy it again"
+            f"the MATLAB file cannot be read: {str(error)[:100]}", remedy="copy it again"
         ) from None
     raise DataError(
-        f"holds no structures with {', '.join(sorted(fields))}",
-        file=path,
-        remedy="give the file as published",
+        f"holds no structures with {', '.join(sorted(fields))}", remedy="give the file as published"
     )
 
 

@@ -65,7 +65,6 @@ def read(request: Request) -> list[Recording]:
         which = f"SHA-256 {sha256_of(path)}" if size <= limits.PICKLE_BYTES else f"{size >> 20} MiB"
         raise DataError(
             f"a pickle can run code, and this one ({which}) is in no catalogue",
-            file=path,
             remedy=f"if you trust its source, add it to a catalogue of your own ({CATALOG_VARIABLE})",
         )
     table = read_table(path)
@@ -76,12 +75,11 @@ def read(request: Request) -> list[Recording]:
             if "imu_yaw_0" in table:
                 return _windows(path, table, request.conventions)
     except KeyError as error:
-        raise DataError(f"column {error} is missing", file=path, remedy="give an unchanged table") from None
+        raise DataError(f"column {error} is missing", remedy="give an unchanged table") from None
     except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"cannot be read: {error}", file=path, remedy="give an unchanged table") from None
+        raise DataError(f"cannot be read: {error}", remedy="give an unchanged table") from None
     raise DataError(
         "has neither the columns of a drive (ros_time) nor those of windows (imu_yaw_0)",
-        file=path,
         remedy="give a raw_dataframe.pkl or a slip_dataset_all.pkl of the DRIVE data",
     )
 

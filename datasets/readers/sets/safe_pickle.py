@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
-from terrafusion.datasets.readers.sets.pickled_frame import (
-    ALLOWED,
-    PickledFrame,
-    PickledPartial,
-    StandIn,
-)
+from terrafusion.datasets.readers.sets.pickled_frame import ALLOWED, PickledFrame, PickledPartial, StandIn
 
 LARGEST = 1e30
 """No number of a log is larger; squares of these are still numbers."""
@@ -126,25 +121,24 @@ def read_table(path: Path) -> dict[str, NDArray[Any]]:
         size = path.stat().st_size
         data = path.read_bytes() if size <= limits.PICKLE_BYTES else b""
     except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
+        raise DataError(f"cannot be read: {error.strerror or error}") from None
     if not data:
         what = f"the pickle has {size / 2**20:.0f} MiB" if size else "the file is empty"
-        raise DataError(what, file=path, remedy=f"give a table of up to {limits.PICKLE_BYTES // 2**20} MiB")
+        raise DataError(what, remedy=f"give a table of up to {limits.PICKLE_BYTES // 2**20} MiB")
     try:
         frame = _Machine(io.BytesIO(data)).load()
         if not isinstance(frame, PickledFrame) or frame.manager is None:
-            raise DataError("the pickle holds no DataFrame", file=path, remedy="pickle a pandas DataFrame")
+            raise DataError("the pickle holds no DataFrame", remedy="pickle a pandas DataFrame")
         return frame.manager.columns()
     except _RefusedError as refused:
         raise DataError(
             f"the pickle asks for {shown(str(refused))}, which no table needs",
-            file=path,
             remedy="do not trust this file",
         ) from None
     except _BROKEN as error:
         why = f": {shown(str(error))}" if str(error) else ""
         raise DataError(
-            f"the pickle cannot be read{why}", file=path, remedy="copy it again; it holds no plain DataFrame"
+            f"the pickle cannot be read{why}", remedy="copy it again; it holds no plain DataFrame"
         ) from None
 
 

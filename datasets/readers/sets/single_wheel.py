@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.matlab_v5 import is_v5, read_structures, structures_with
 
@@ -127,10 +127,15 @@ def read_wheel_trials(path: Path | str) -> WheelTrials:
     path = Path(path)
     if not path.is_file():
         raise DataError("no such file", file=path, remedy="check the path")
+    with errors_of(path):
+        return _trials(path)
+
+
+def _trials(path: Path) -> WheelTrials:
     raw = read_structures(path, FIELDS)
-    columns = {name: _column(path, name, raw[name]) for name in FIELDS}
+    columns = {name: _column(name, raw[name]) for name in FIELDS}
     if not len(columns["slip"]):
-        raise DataError("holds no trials", file=path, remedy="give the file as published")
+        raise DataError("holds no trials", remedy="give the file as published")
     means = {f"{name}_{unit}": f * columns[f"avg_{key}"] for key, (name, unit, f) in _QUANTITIES.items()}
     spreads = {
         f"{name}_sd_{unit}": abs(f) * columns[f"std_{key}"] for key, (name, unit, f) in _QUANTITIES.items()
@@ -146,12 +151,11 @@ def read_wheel_trials(path: Path | str) -> WheelTrials:
     )
 
 
-def _column(path: Path, name: str, cells: list[Array]) -> Array:
+def _column(name: str, cells: list[Array]) -> Array:
     bad = next((i for i, cell in enumerate(cells) if cell.shape != (1,) or not abs(cell[0]) < LARGEST), None)
     if bad is not None:
         raise DataError(
             f"trial {bad} has {len(cells[bad])} values, or an impossible one",
-            file=path,
             channel=name,
             remedy="a trial has one number of each",
         )
@@ -183,6 +187,5 @@ def read(request: Request) -> NoReturn:
     trials = read_wheel_trials(request.path)
     raise DataError(
         f"holds {len(trials)} trials of a single wheel, not a drive",
-        file=request.path,
         remedy="`terrafusion inspect` sums them up; in Python, single_wheel.read_wheel_trials reads them",
     )

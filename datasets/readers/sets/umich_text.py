@@ -145,7 +145,6 @@ def _choice(given: RecordingFile, kind: str, candidates: list[RecordingFile]) ->
     if len(same) > 1:
         raise DataError(
             f"{' and '.join(part.path.name for part in same)} both go with it",
-            file=given.path,
             remedy="put the files of one recording into a folder of their own",
         )
     return same[0]

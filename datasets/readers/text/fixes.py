@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,7 +57,7 @@ def gnss_channel(
     Raises:
         DataError: a latitude or longitude that is not on Earth.
     """
-    held, enu, datum, notes = located(request.path, fixes, datum)
+    held, enu, datum, notes = located(fixes, datum)
     if not held.any():
         return None, datum, [*notes, "gnss: no row holds a fix; the channel is absent"]
     fixes = fixes.select(held)
@@ -70,7 +69,7 @@ def gnss_channel(
 
 
 def located(
-    file: Path, fixes: Fixes, datum: Datum | None, *, channel: str = "gnss", rows: str = "rows"
+    fixes: Fixes, datum: Datum | None, *, channel: str = "gnss", rows: str = "rows"
 ) -> tuple[NDArray[np.bool_], Array, Datum | None, list[str]]:
     """Which of the fixes (N,) hold a position, their ENU positions (M, 3), the datum, and notes.
 
@@ -93,7 +92,6 @@ def located(
         i = int(bad[0])
         raise DataError(
             f"latitude {llh[i, 0]:g} deg, longitude {llh[i, 1]:g} deg is not on Earth",
-            file=file,
             channel=channel,
             time_s=float(fixes.t_ns[held][i] - fixes.t_ns[0]) * 1e-9,
             remedy="give degrees up to 90 and 180; are they swapped, or in another unit?",

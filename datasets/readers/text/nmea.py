@@ -35,17 +35,17 @@ def read(request: Request) -> list[Recording]:
     """The one recording of a log: its GNSS channel."""
     path = request.path
     if path.stat().st_size > limits.TEXT_BYTES:
-        raise limits.too_much(path, "MB", limits.TEXT_BYTES / 2**20)
+        raise limits.too_much("MB", limits.TEXT_BYTES / 2**20)
     data = path.read_bytes()
-    check_lines(path, data)
-    epochs, notes = collect(path, data.decode("latin-1"))
-    t_ns, date_notes = _dated(path, epochs)
+    check_lines(data)
+    epochs, notes = collect(data.decode("latin-1"))
+    t_ns, date_notes = _dated(epochs)
     times = row_times(request, "gnss", t_ns)
     fixes, more = _fixes(request, epochs, t_ns)
     fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
     gnss, datum, rest = gnss_channel(request, fixes)
     if gnss is None:
-        raise DataError("no sentence holds a fix", file=path, remedy="record it again under open sky")
+        raise DataError("no sentence holds a fix", remedy="record it again under open sky")
     recording = Recording(
         name=path.stem,
         start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
@@ -58,7 +58,7 @@ def read(request: Request) -> list[Recording]:
     return [recording]
 
 
-def _dated(path: Path, epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
+def _dated(epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
     """Unix nanoseconds of the epochs: and notes on the source of their date."""
     day, date = epochs.column("day"), epochs.column("date")
     if np.isfinite(date).any():

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from functools import reduce
 from operator import xor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -110,7 +109,7 @@ class _Log:
         return self.epochs[-1]
 
 
-def collect(path: Path, text: str) -> tuple[NmeaEpochs, list[str]]:
+def collect(text: str) -> tuple[NmeaEpochs, list[str]]:
     """All epochs of a log with a position, and what was wrong with its sentences.
 
     Raises:
@@ -140,7 +139,7 @@ def collect(path: Path, text: str) -> tuple[NmeaEpochs, list[str]]:
             epoch.receipt_s = _receipt_s(text, match.start())
     if damaged * 2 > total or not total:
         what = f"{damaged} of {total} sentences are damaged" if total else "no sentence of a receiver"
-        raise DataError(what, file=path, remedy="check the cable and the baud rate, and record it again")
+        raise DataError(what, remedy="check the cable and the baud rate, and record it again")
     notes = []
     if damaged:
         notes.append(f"gnss: {damaged} of {total} sentences are damaged (checksum or fields); left out")
@@ -148,13 +147,13 @@ def collect(path: Path, text: str) -> tuple[NmeaEpochs, list[str]]:
         notes.append(f"gnss: {timeless} sentences of a receiver without time yet; left out")
     if unchecked:
         notes.append(f"gnss: {unchecked} sentences have no checksum; taken as they are")
-    return _with_position(path, log), notes
+    return _with_position(log), notes
 
 
-def _with_position(path: Path, log: _Log) -> NmeaEpochs:
+def _with_position(log: _Log) -> NmeaEpochs:
     epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
-        raise DataError("no GGA or RMC sentence has a position", file=path, remedy="record GGA or RMC")
+        raise DataError("no GGA or RMC sentence has a position", remedy="record GGA or RMC")
     # RMC repeats the position of a GGA with fewer digits
     return NmeaEpochs([epoch for epoch in epochs if epoch.from_gga] or epochs, log.left_out)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.clock import in_order, repair_together
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.delimited import (
@@ -70,10 +70,15 @@ def read_rows(
             many numbers, a cell that is no finite number, with its line and, where that can be read,
             its time. Times are not checked for order: `put_in_time` does that.
     """
+    with errors_of(path):
+        return _read(path, columns, separator, header)
+
+
+def _read(path: Path, columns: Sequence[str], separator: str, header: bool) -> NumberRows:
     data = read_text(path)
     if data.count(b"\n") > limits.NUMBER_ROWS:
-        raise limits.too_much(path, "lines", limits.NUMBER_ROWS, "split it into shorter recordings")
-    names = _header(path, data, columns, separator) if header else tuple(columns)
+        raise limits.too_much("lines", limits.NUMBER_ROWS, "split it into shorter recordings")
+    names = _header(data, columns, separator) if header else tuple(columns)
     layout = TextLayout(names, separator, first_line=2 if header else 1, time=columns[0])
     table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
     t_ns = table.times_ns(columns[0])
@@ -128,9 +133,9 @@ def are_numbers(head: bytes) -> bool:
         return False
 
 
-def _header(path: Path, data: bytes, columns: Sequence[str], separator: str) -> tuple[str, ...]:
+def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, ...]:
     line = next((line for _, line in head_lines(data, 1)), "")
     names = tuple(split(line, separator))
     if sorted(names) != sorted(columns):
-        raise DataError(f"the header is '{shown(line)}'", file=path, remedy=f"give {', '.join(columns)}")
+        raise DataError(f"the header is '{shown(line)}'", remedy=f"give {', '.join(columns)}")
     return names

@@ -25,7 +25,6 @@ class ParquetColumns:
         except ImportError:
             raise DataError(
                 "Parquet needs pyarrow, which is not installed",
-                file=path,
                 remedy='install it with: pip install "terrafusion[parquet]"',
             ) from None
         self.path = path
@@ -36,16 +35,16 @@ class ParquetColumns:
             raise self._damaged(error) from None
         self.names: list[str] = list(self._file.schema_arrow.names)
         self.rows: int = self._file.metadata.num_rows
-        limits.check_columns(path, len(self.names))
+        limits.check_columns(len(self.names))
         if not self.names or len(set(self.names)) < len(self.names):
-            raise DataError("has no columns, or two of one name", file=path, remedy="name each column once")
+            raise DataError("has no columns, or two of one name", remedy="name each column once")
         self._table: Any = None
 
     def read(self, names: list[str]) -> None:
         """Read these columns; texts stay packed until they are asked for."""
         size = self.path.stat().st_size
-        limits.check_table(self.path, self.rows, len(names), size)
-        limits.check_expansion(self.path, self._stored_bytes(names), size)
+        limits.check_table(self.rows, len(names), size)
+        limits.check_expansion(self._stored_bytes(names), size)
         self._check_kinds(names)
         try:
             self._table = self._reopened(names).read(columns=names)
@@ -60,7 +59,7 @@ class ParquetColumns:
             kind = self._file.schema_arrow.field(name).type
             if pa.types.is_nested(kind):
                 what = f"column '{shown(name)}' holds {shown(str(kind))}, no numbers or texts"
-                raise DataError(what, file=self.path, remedy="write it as double or string")
+                raise DataError(what, remedy="write it as double or string")
 
     def _stored_bytes(self, names: list[str]) -> int:
         """Bytes of the columns' pages when unpacked, by the file's own account."""
@@ -88,15 +87,11 @@ class ParquetColumns:
         column = self._table.column(name)
         kind = column.type
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-            raise DataError(
-                f"column '{name}' holds {kind}, no numbers", file=self.path, remedy="write it as double"
-            )
+            raise DataError(f"column '{name}' holds {kind}, no numbers", remedy="write it as double")
         values = np.asarray(column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), dtype=float)
         if np.isinf(values).any():
             row = int(np.flatnonzero(np.isinf(values))[0])
-            raise DataError(
-                f"column '{name}' is infinite in row {row + 1}", file=self.path, remedy="leave it null"
-            )
+            raise DataError(f"column '{name}' is infinite in row {row + 1}", remedy="leave it null")
         return values
 
     def texts(self, name: str) -> NDArray[Any]:
@@ -119,9 +114,7 @@ class ParquetColumns:
         column = self._table.column(name)
         kind = column.type
         if column.null_count:
-            raise DataError(
-                f"{column.null_count} rows have no '{name}'", file=self.path, remedy="remove them"
-            )
+            raise DataError(f"{column.null_count} rows have no '{name}'", remedy="remove them")
         try:
             if pa.types.is_timestamp(kind):
                 return np.asarray(column.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy())
@@ -142,9 +135,9 @@ class ParquetColumns:
 
     def _no_time(self, name: str, unit: str) -> DataError:
         return DataError(
-            f"column '{name}' holds times that do not fit into 64 bits of ns", file=self.path,
+            f"column '{name}' holds times that do not fit into 64 bits of ns",
             remedy=f"is the unit {unit}?",
         )  # fmt: skip
 
     def _damaged(self, error: BaseException) -> DataError:
-        return DataError(f"no readable Parquet: {error}"[:200], file=self.path, remedy="write it again")
+        return DataError(f"no readable Parquet: {error}"[:200], remedy="write it again")

@@ -52,7 +52,6 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
         i = int(back[0])
         raise DataError(
             f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}",
-            file=request.path,
             channel=channel,
             time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9,
             remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",

@@ -67,9 +67,9 @@ def claims(path: Path, head: bytes) -> bool:
 def read(request: Request) -> list[Recording]:
     """The one recording of a solution file: its GNSS channel."""
     path, data = request.path, read_text(request.path)
-    header = _header(path, data)
+    header = _header(data)
     columns = _columns(path, data, header)
-    t_ns, notes = _times(path, columns, header)
+    t_ns, notes = _times(columns, header)
     times = row_times(request, "gnss", t_ns)
     notes += [*columns.notes, *times.notes]
     if b"/geodetic" in data[:4096] and header.kind != BASELINE:
@@ -77,7 +77,7 @@ def read(request: Request) -> list[Recording]:
     solution = _Solution(request, columns, header, times)
     gnss, datum, more = solution.baseline() if header.kind == BASELINE else solution.geodetic()
     if gnss is None:
-        raise DataError("no row holds a fix", file=path, remedy="process the observations again")
+        raise DataError("no row holds a fix", remedy="process the observations again")
     recording = Recording(
         name=path.stem,
         start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
@@ -95,7 +95,7 @@ def _is_row(head: bytes) -> bool:
     return len(words) >= 7 and (words[0].count(b"/") == 2 or words[0].isdigit())
 
 
-def _header(path: Path, data: bytes) -> PosHeader:
+def _header(data: bytes) -> PosHeader:
     base: tuple[float, ...] | None = None
     found: PosHeader | None = None
     for number, line in head_lines(data):
@@ -111,19 +111,16 @@ def _header(path: Path, data: bytes) -> PosHeader:
         mark = line[line.index(kind) + len(kind) :][:1]
         separator = mark if mark and not mark.isspace() else ("\t" if mark == "\t" else BLANKS)
         time_system, *names = split(line[1:].strip(), separator)
-        limits.check_columns(path, len(names))
+        limits.check_columns(len(names))
         found = PosHeader(number, tuple(names), kind, separator, time_system, base)
     if found is None:
         raise DataError(
             "no `%` line names the columns, so neither time system nor position is known",
-            file=path,
             remedy="write the solution with its header (out-outhead = on)",
         )
     if found.time_system not in TIME_SYSTEMS:
         raise DataError(
-            f"unknown time system '{found.time_system[:20]}'",
-            file=path,
-            remedy=f"known are {', '.join(TIME_SYSTEMS)}",
+            f"unknown time system '{found.time_system[:20]}'", remedy=f"known are {', '.join(TIME_SYSTEMS)}"
         )
     return found
 
@@ -142,7 +139,7 @@ def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
         names += [f"{name} {part}" for part in "dms"] if name in POSITIONS[DMS][:2] else [name]
     repeated = [name for i, name in enumerate(names) if name in names[:i]]
     if repeated or not set(POSITIONS[header.kind][1:]) <= set(header.names):
-        raise DataError("the line of column names is damaged", file=path, remedy="write the solution again")
+        raise DataError("the line of column names is damaged", remedy="write the solution again")
     row = next((x for n, x in head_lines(data) if n > header.line and x.strip() and x[0] != "%"), "")
     cells = split(row, header.separator)
     one_cell = bool(cells) and "/" in cells[0] and ":" in cells[0]
@@ -151,7 +148,7 @@ def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
     return read_columns(path, data, layout, names, time)
 
 
-def _times(path: Path, columns: TextTable, header: PosHeader) -> tuple[TimesNs, list[str]]:
+def _times(columns: TextTable, header: PosHeader) -> tuple[TimesNs, list[str]]:
     """Unix nanoseconds of the rows in the order of the file, and notes on UTC."""
     gps_epoch_ns = np.datetime64("1980-01-06", "ns").astype(np.int64)
     if "week" in columns.texts:
@@ -261,7 +258,6 @@ class _Solution:
             i = int(far[0])
             raise DataError(
                 f"the ECEF position {xyz[i, 0]:g}, {xyz[i, 1]:g}, {xyz[i, 2]:g} m is not near the ground",
-                file=self.request.path,
                 channel="gnss",
                 time_s=float(self.times.t_ns[i] - self.times.t_ns[0]) * 1e-9,
                 remedy="process the observations again",
@@ -291,7 +287,6 @@ class _Solution:
         if strange.size:
             raise DataError(
                 f"Q is {q[strange[0]]:g} at data row {int(strange[0]) + 1}",
-                file=self.request.path,
                 remedy="known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP",
             )
         if (q == 6).any():

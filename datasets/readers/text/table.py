@@ -97,7 +97,7 @@ def read(request: Request) -> list[Recording]:
     for name in column_map.columns():
         if name not in columns.names:
             few = ", ".join(columns.names[:SHOWN_COLUMNS])
-            raise DataError(f"there is no column '{name}'", file=path, remedy=f"the file has {few}")
+            raise DataError(f"there is no column '{name}'", remedy=f"the file has {few}")
     columns.read(column_map.columns())
     return [_recording(request, columns, column_map, notes)]
 
@@ -107,7 +107,6 @@ def _mapless(path: Path, names: list[str]) -> DataError:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
     return DataError(
         f"nothing says what the columns {', '.join(names)} are",
-        file=path,
         remedy=f"correct this and save it as {path.name}{MAP_SUFFIX}: {{{starter_map(names)}}}",
     )
 
@@ -116,13 +115,13 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     t_ns, time_notes = _times(columns, column_map)
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
-        raise DataError("holds no rows", file=request.path, remedy="record or copy it again")
+        raise DataError("holds no rows", remedy="record or copy it again")
     start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     reader = _Reader(_Source(request.path, columns, column_map, times, start_ns), meta, request)
     channels = {name: getattr(reader, name)() for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
-        raise DataError("no channel holds a sample", file=request.path, remedy="check the column map")
+        raise DataError("no channel holds a sample", remedy="check the column map")
     of_text = columns.notes if isinstance(columns, TextColumns) else ()
     notes = [*notes, *time_notes, *of_text, *times.notes, *reader.notes]
     recording = recording_of(channels, meta, request.path.stem, notes)
@@ -141,7 +140,6 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     if late.size:
         raise DataError(
             f"the time of row {int(late[0]) + 1} is {t_ns[late[0]] * 1e-9:.9g} s",
-            file=columns.path,
             remedy=f"is the unit {time.unit}?",
         )
     if time.epoch == "none":
@@ -161,7 +159,6 @@ def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[s
     except NotADecimal as bad:
         raise DataError(
             f"column '{name}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
-            file=columns.path,
             remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
         ) from None
     zoned = bool(texts) and re.search(r"(Z|[+-]\d\d:?\d\d)$", texts[0].strip())
@@ -212,7 +209,6 @@ class _Source:
             if word.strip() and not meant:
                 raise DataError(
                     f"column '{of.column}' is '{word[:40]}'",
-                    file=self.path,
                     remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
                 )
         return np.array(meanings, dtype=object)[inverse]
@@ -241,9 +237,7 @@ class _Reader(ChannelReader):
             return None
         for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
             if (a in table.numbers) != (b in table.numbers):
-                raise DataError(
-                    f"has only one of {a} and {b}", file=self.request.path, channel="gnss", remedy="give both"
-                )
+                raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
         fix = self._fix(table)
         sigma = table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m"))
         velocity = table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None

@@ -32,7 +32,7 @@ class TextColumns:
         self.path = path
         self._map = column_map
         self._data = read_text(path)
-        self._layout = _layout(path, self._data, column_map)
+        self._layout = _layout(self._data, column_map)
         self.names = list(self._layout.names)
         self.notes: tuple[str, ...] = ()
 
@@ -48,7 +48,7 @@ class TextColumns:
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
         if name in self._table.texts:
-            raise DataError(f"column '{name}' is mapped twice, as numbers and not", file=self.path)
+            raise DataError(f"column '{name}' is mapped twice, as numbers and not")
         return self._table.numbers[name]
 
     def texts(self, name: str) -> NDArray[Any]:
@@ -60,7 +60,7 @@ class TextColumns:
         return self._table.times_ns(name, unit)
 
 
-def _layout(path: Path, data: bytes, column_map: ColumnMap | None) -> TextLayout:
+def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     """Names from the first line that is no comment, or from the comment before a first line of numbers."""
     comment, header, number = "", "", 0
     for at, line in head_lines(data):
@@ -70,7 +70,7 @@ def _layout(path: Path, data: bytes, column_map: ColumnMap | None) -> TextLayout
             header, number = line, at
             break
     if not header:
-        raise DataError("the first line is no header of a table", file=path, remedy="write names of columns")
+        raise DataError("the first line is no header of a table", remedy="write names of columns")
     separator = (column_map.separator if column_map else "") or separator_of(header)
     cells = split(header, separator)
     first_line = number + 1
@@ -78,10 +78,10 @@ def _layout(path: Path, data: bytes, column_map: ColumnMap | None) -> TextLayout
         cells, first_line = [str(i) for i in range(1, len(cells) + 1)], number
     elif comment and len(split(comment, separator)) == len(cells) and _is_row(cells):
         cells, first_line = split(comment, separator), number
-    limits.check_columns(path, len(cells))
+    limits.check_columns(len(cells))
     repeated = limits.repeated(name for name in cells if name)
     if repeated:
-        raise DataError(f"column '{repeated}' comes twice", file=path, remedy="rename one of them")
+        raise DataError(f"column '{repeated}' comes twice", remedy="rename one of them")
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 

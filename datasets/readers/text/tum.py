@@ -9,13 +9,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.delimited import (
-    BLANKS,
-    TextLayout,
-    head_lines,
-    read_columns,
-    read_text,
-)
+from terrafusion.datasets.readers.delimited import BLANKS, TextLayout, head_lines, read_columns, read_text
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.text.row_times import row_times
@@ -46,7 +40,7 @@ def read(request: Request) -> list[Recording]:
     t_ns, table, notes = tum_rows(request.path)
     times = row_times(request, "truth", t_ns)
     table = table[times.order]
-    _check_norms(request.path, table[:, 3:])
+    _check_norms(table[:, 3:])
     fresh = np.concatenate([[True], np.diff(times.t_ns) > 0])
     if not fresh.all():
         notes += (f"truth: {int((~fresh).sum())} poses with a repeated time left out",)
@@ -77,7 +71,7 @@ def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
     data = read_text(path)
     first = next((line for _, line in head_lines(data) if line.strip() and line.strip()[0] != "#"), "")
     if not first:
-        raise DataError("no poses", file=path, remedy="a line is: t x y z qx qy qz qw")
+        raise DataError("no poses", remedy="a line is: t x y z qx qy qz qw")
     layout = TextLayout(("t", *COLUMNS), "," if "," in first else BLANKS, 1, "#")
     columns = read_columns(path, data, layout, COLUMNS, ["t"])
     table = columns.stack(COLUMNS)
@@ -88,13 +82,12 @@ def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
     return columns.times_ns("t"), table, columns.notes
 
 
-def _check_norms(path: Path, quaternion: Array) -> None:
+def _check_norms(quaternion: Array) -> None:
     norm = _norms(quaternion)
     off = np.flatnonzero(np.abs(norm - 1.0) > NORM_TOLERANCE)
     if off.size:
         raise DataError(
             f"the quaternion has norm {norm[off[0]]:.3g} in row {int(off[0]) + 1}",
-            file=path,
             channel="truth",
             remedy="give unit quaternions x, y, z, w",
         )

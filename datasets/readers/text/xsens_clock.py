@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ class DeviceClock:
     notes: tuple[str, ...]
 
 
-def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> DeviceClock:
+def clock_of(columns: TextTable, settings: dict[str, str]) -> DeviceClock:
     """The best clock the export has.
 
     UTC on every row is taken as it is. Else the ticks count from one to the next row, and the
@@ -41,7 +40,7 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Device
     Raises:
         DataError: none of ticks, UTC, or a packet counter with the update rate; UTC that is no date.
     """
-    utc, valid = _utc(path, columns)
+    utc, valid = _utc(columns)
     ticks = columns.numbers.get("SampleTimeFine")
     counter = next((columns.numbers[n] for n in ("PacketCounter", "Counter") if n in columns.numbers), None)
     if valid.all() or (valid.any() and not _known(ticks) and not _known(counter)):
@@ -49,19 +48,17 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Device
     if _known(ticks):
         assert ticks is not None
         rows = np.isfinite(ticks)
-        t_ns = _unwrapped(path, ticks[rows], TICK_SPAN) * TICK_NS
-        _check_ticks(path, t_ns)
+        t_ns = _unwrapped(ticks[rows], TICK_SPAN) * TICK_NS
+        _check_ticks(t_ns)
         notes: tuple[str, ...] = ()
     elif _known(counter):
         assert counter is not None
-        rate_hz = _update_rate(path, settings)
+        rate_hz = _update_rate(settings)
         rows = np.isfinite(counter)
-        t_ns = np.rint(_unwrapped(path, counter[rows], COUNTER_SPAN) * (1e9 / rate_hz)).astype(np.int64)
+        t_ns = np.rint(_unwrapped(counter[rows], COUNTER_SPAN) * (1e9 / rate_hz)).astype(np.int64)
         notes = (f"times are packet counts at the update rate of {rate_hz:g} Hz: no clock was exported",)
     else:
-        raise DataError(
-            "no row has a time", file=path, remedy="export SampleTimeFine, UTC time or PacketCounter"
-        )
+        raise DataError("no row has a time", remedy="export SampleTimeFine, UTC time or PacketCounter")
     t_ns, date_note = _dated(t_ns, utc[rows], valid[rows])
     return DeviceClock(t_ns, rows, (*notes, date_note, *_left_out(rows)))
 
@@ -74,7 +71,7 @@ def _left_out(rows: NDArray[np.bool_]) -> tuple[str, ...]:
     return () if rows.all() else (f"{int((~rows).sum())} of {len(rows)} rows have no time; left out",)
 
 
-def _utc(path: Path, columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
+def _utc(columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
     """UTC as Unix nanoseconds (N,), and the rows (N,) that hold it."""
     parts = columns.stack(UTC)
     valid = np.asarray(np.isfinite(parts[:, :6]).all(axis=1))
@@ -95,20 +92,18 @@ def _utc(path: Path, columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
         raise DataError(
             f"UTC '{' '.join(f'{x:g}' for x in given[i])}' is no date, in data row "
             f"{int(np.flatnonzero(valid)[i]) + 1}",
-            file=path,
             remedy="remove that row",
         )
     t_ns[valid] = ((days * 24 + hour) * 60 + minute) * 60 * 10**9 + second * 10**9 + nano
     return t_ns, valid
 
 
-def _unwrapped(path: Path, counts: Array, span: int) -> NDArray[np.int64]:
+def _unwrapped(counts: Array, span: int) -> NDArray[np.int64]:
     """Counts (N,) that go on where those of the file start again from zero."""
     strange = np.flatnonzero((counts < 0) | (counts >= TICK_SPAN))
     if strange.size:
         raise DataError(
             f"the counter is {counts[strange[0]]:g} in data row {int(strange[0]) + 1}",
-            file=path,
             remedy="remove that row",
         )
     whole = counts.astype(np.int64)
@@ -116,25 +111,23 @@ def _unwrapped(path: Path, counts: Array, span: int) -> NDArray[np.int64]:
     return whole + wraps * span
 
 
-def _check_ticks(path: Path, t_ns: TimesNs) -> None:
+def _check_ticks(t_ns: TimesNs) -> None:
     steps = np.diff(t_ns)
     step_s = float(np.median(steps)) * 1e-9 if steps.size else 0.0
     if step_s > 1.0 / SLOWEST_HZ:
         raise DataError(
             f"SampleTimeFine grows by {step_s * 1e4:.0f} a row: {1 / step_s:.2g} Hz, were it ticks of 10 kHz",
-            file=path,
             remedy="if it is in microseconds (Xsens DOT), read the file with a column map",
         )
 
 
-def _update_rate(path: Path, settings: dict[str, str]) -> float:
+def _update_rate(settings: dict[str, str]) -> float:
     text = next((settings[k] for k in ("update rate", "sample rate", "output rate") if k in settings), "")
     number = re.match(r"\s*(\d+(?:\.\d+)?)", text)
     rate_hz = float(number[1]) if number else 0.0
     if not 0.0 < rate_hz <= 1e5:
         raise DataError(
             "there is neither SampleTimeFine nor UTC, and no `// Update Rate:` to count packets by",
-            file=path,
             remedy="export SampleTimeFine, or add the line `// Update Rate: 100.0Hz`",
         )
     return rate_hz

@@ -1,7 +1,5 @@
 """Angular rate and specific force of an MT Manager export, and the unit the rates are in."""
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +23,7 @@ DEG = np.pi / 180.0
 
 
 def inertial(
-    path: Path, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
+    columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Imu | None, list[str]]:
     """The IMU channel of the rows that hold a sample (None where none does), and notes.
 
@@ -39,7 +37,7 @@ def inertial(
         gyro = _rotation_vectors(columns.stack(INCREMENTS[1])) / period_s
         notes.append(f"imu: rates are orientation increments over {period_s:g} s")
     else:
-        gyro, rate_notes = _in_radps(path, gyro, columns, t_ns, settings)
+        gyro, rate_notes = _in_radps(gyro, columns, t_ns, settings)
         notes += rate_notes
     if np.isnan(accel).all() and INCREMENTS[0][0] in columns.numbers and period_s > 0.0:
         accel = columns.stack(INCREMENTS[0]) / period_s
@@ -54,14 +52,13 @@ def inertial(
 
 
 def _in_radps(
-    path: Path, gyro: Array, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
+    gyro: Array, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Array, list[str]]:
     """Rates in rad/s: by the column's name, else by the attitude, else as documented."""
     units = {settings.get(f"unit of {name}", "") for name in GYR}
     if len(units) > 1 or not units <= {"", "deg/s", "rad/s"}:
         raise DataError(
             f"rates are in {', '.join(sorted(unit or 'no unit' for unit in units))}",
-            file=path,
             channel="imu",
             remedy="give all three in rad/s or in deg/s",
         )
@@ -77,7 +74,6 @@ def _in_radps(
         i = int(beyond[0])
         raise DataError(
             f"a rate of {np.nanmax(np.abs(gyro[i])):g} rad/s is beyond what an MTi measures",
-            file=path,
             channel="imu",
             time_s=float(t_ns[i] - t_ns[0]) * 1e-9,
             remedy="if the export is in deg/s, name the columns `Gyr_X [deg/s]` ... in its header",

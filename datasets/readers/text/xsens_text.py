@@ -64,14 +64,14 @@ def claims(path: Path, head: bytes) -> bool:
 def read(request: Request) -> list[Recording]:
     """The one recording of an export: IMU, and GNSS where the device has it."""
     columns, settings, notes = _columns(request.path)
-    clock = clock_of(request.path, columns, settings)
+    clock = clock_of(columns, settings)
     times = row_times(request, "imu", clock.t_ns)
     columns = _select(columns, clock.rows, times.order)
     notes += [*columns.notes, *clock.notes, *times.notes]
-    imu, more = inertial(request.path, columns, times.t_ns, settings)
+    imu, more = inertial(columns, times.t_ns, settings)
     gnss, datum, of_gnss = _gnss(request, columns, times.t_ns, settings)
     if imu is None and gnss is None:
-        raise DataError("no row holds an IMU sample or a fix", file=request.path, remedy="export it again")
+        raise DataError("no row holds an IMU sample or a fix", remedy="export it again")
     start_ns = int(times.t_ns[0])
     recording = Recording(
         name=request.path.stem,
@@ -107,11 +107,11 @@ def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
     data = read_text(path)
     found = _header(data)
     if found is None:
-        raise DataError("no line of column names", file=path, remedy="export it again, with the header")
+        raise DataError("no line of column names", remedy="export it again, with the header")
     number, line, settings = found
     separator = separator_of(line)
     raw = split(line, separator)
-    limits.check_columns(path, len(raw))
+    limits.check_columns(len(raw))
     if raw and not raw[-1]:
         raw.pop()
     names = [_bare(name) for name in raw]
@@ -120,7 +120,7 @@ def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
             settings[f"unit of {name}"] = full[len(name) :].strip(" []()")
     repeated = limits.repeated(names)
     if repeated:
-        raise DataError(f"column '{repeated}' comes twice", file=path, remedy="export it again")
+        raise DataError(f"column '{repeated}' comes twice", remedy="export it again")
     layout = TextLayout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
     attitudes = [name for group in ATTITUDES for name in group]
     wanted = {*COUNTERS, TICKS, *ACC, *GYR, *INCREMENTS[0], *INCREMENTS[1], *attitudes, *POSITION, *UTC}
@@ -168,7 +168,7 @@ def _gnss(
     if not rows.any():
         return None, None, ["gnss: no row holds a position; the channel is absent"]
     notes = ["gnss: the position is the device's own, fused with its IMU: errors of near fixes go together"]
-    fix, fix_notes = _fix(request.path, columns, rows)
+    fix, fix_notes = _fix(columns, rows)
     velocity, more = _velocity(columns, settings)
     fixes = Fixes(
         t_ns[rows],
@@ -181,14 +181,14 @@ def _gnss(
     return gnss, datum, [*notes, *fix_notes, *more, *rest]
 
 
-def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
+def _fix(columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
     name = next((name for name in STATUS if name in columns.texts), None)
     if name is None:
         return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [
             "gnss: the export has no StatusWord; all fixes are taken as 'single'"
         ]
     words, inverse = distinct(columns.texts[name])
-    codes = np.array([_class_of(status) for status in _status_words(path, name, words)], dtype=np.uint8)
+    codes = np.array([_class_of(status) for status in _status_words(name, words)], dtype=np.uint8)
     fix = codes[inverse]
     if "" in words:  # the status may come at a lower rate than the position
         last = np.maximum.accumulate(np.where(inverse != words.index(""), np.arange(len(fix)), 0))
@@ -196,7 +196,7 @@ def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArr
     return fix[rows], []
 
 
-def _status_words(path: Path, name: str, words: list[str]) -> list[int]:
+def _status_words(name: str, words: list[str]) -> list[int]:
     """Status words written as 32 binary digits, in hexadecimal, or in decimal."""
     cells = [word.strip() for word in words]
     given = [cell for cell in cells if cell]
@@ -207,7 +207,7 @@ def _status_words(path: Path, name: str, words: list[str]) -> list[int]:
         pattern = r"[+-]?[0-9]+" if base == 10 else r"(0[xX])?[0-9a-fA-F]+"
         bad = next((cell for cell in given if not re.fullmatch(pattern, cell)), given[0])
         raise DataError(
-            f"column '{name}' holds '{bad[:40]}'", file=path, remedy="it must be a number or hexadecimal"
+            f"column '{name}' holds '{bad[:40]}'", remedy="it must be a number or hexadecimal"
         ) from None
 
 
