@@ -95,8 +95,7 @@ def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
 
 def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
-    path = path_by(context.recording, "gnss")
-    model = path_model(context, path) if path is not None else None
+    model = path_model(context, path_by(context.recording, "gnss"))
     if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SIGNIFICANT_S):
         return
     late = model.delay_s

@@ -4,15 +4,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import (
-    CheckContext,
-    Finding,
-    changed_field,
-    scaled,
-    without_rows,
-)
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, changed_field, scaled
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.channels import Barometer
 
 PRESSURE_PA = (30e3, 110e3)
 """Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""
@@ -50,7 +44,7 @@ def check_pressure(context: CheckContext) -> Iterator[Finding]:
             f"{int(beyond.sum())} of {len(known)} pressures are outside the atmosphere's range",
             f"from {known.min():.6g} to {known.max():.6g} Pa",
             "leave these rows out",
-            _within_range,
+            changed("barometer", _within_range),
         )  # fmt: skip
 
 
@@ -96,10 +90,9 @@ def _range(
     )  # fmt: skip
 
 
-def _within_range(recording: Recording) -> Recording:
-    assert recording.barometer is not None
-    p = recording.barometer.pressure_pa
-    return without_rows("barometer", ~((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1])))(recording)
+def _within_range(barometer: Barometer) -> Barometer:
+    p = barometer.pressure_pa
+    return barometer.select((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1]))
 
 
 def _hard_iron(field: Array) -> Iterator[Finding]:

@@ -92,9 +92,14 @@ def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:
     return dataclasses.replace(recording, **{channel: changed})
 
 
-def changed(part: str, change: Callable[[Any], Any]) -> Repair:
-    """A repair that replaces a channel, or another field of a recording, by what `change` makes of it."""
-    return lambda recording: dataclasses.replace(recording, **{part: change(getattr(recording, part))})
+def changed(part: str, change: Callable[..., Any], **given: Any) -> Repair:
+    """A repair that replaces a channel, or another field of a recording, by what `change` makes of it.
+
+    `given` are further arguments of `change`.
+    """
+    return lambda recording: dataclasses.replace(
+        recording, **{part: change(getattr(recording, part), **given)}
+    )
 
 
 def changed_field(channel: str, field: str, change: Callable[[Array], Array]) -> Repair:
@@ -133,10 +138,7 @@ def retimed(recording: Recording, name: str, t_ns: TimesNs) -> Recording:
 
 def clocks_of(recording: Recording) -> dict[str, TimesNs]:
     """Times of all sampled channels, and of the truth."""
-    clocks = {name: channel.t_ns for name, channel in recording.channels().items() if name != "terrain"}
-    if recording.truth is not None and len(recording.truth):
-        clocks["truth"] = recording.truth.t_ns
-    return clocks
+    return {name: t_ns for name, t_ns in recording.clocks().items() if name != "terrain"}
 
 
 def period_s(t_ns: TimesNs) -> float:

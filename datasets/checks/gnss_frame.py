@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, with_fields
 from terrafusion.datasets.checks.motion import (
     course_agreement,
     cumulative,
@@ -164,40 +164,33 @@ def _velocity_fault(fit: VelocityFit) -> tuple[str, str, Repair] | None:
     if fit.r > SURE_R and abs(turn) < ANGLE_ERROR:
         for unit, factor in SPEED_UNITS.items():
             if abs(size / factor - 1.0) < UNIT_ERROR:
-                repair = partial(_velocities, scale=1.0 / factor)
-                return f"look like {unit}", f"divide by {factor:g}", repair
+                return f"look like {unit}", f"divide by {factor:g}", _velocities(scale=1.0 / factor)
         if 0.5 < size < 1.5:
             return None
     reflection = fit.reflection() if 0.5 < abs(fit.mirrored) < 1.5 else None
     if reflection == "swap":
-        return "have east and north swapped", "swap them", partial(_velocities, swap=True)
+        return "have east and north swapped", "swap them", _velocities(swap=True)
     if reflection is not None:
-        repair = partial(_velocities, signs=SIGNS[reflection])
+        repair = _velocities(signs=SIGNS[reflection])
         return f"have the wrong sign of {reflection}", f"change the sign of {reflection}", repair
     if fit.r > fit.mirrored_r + 0.02 and abs(turn) > np.pi - ANGLE_ERROR and 0.5 < size < 1.5:
-        repair = partial(_velocities, signs=(-1.0, -1.0))
+        repair = _velocities(signs=(-1.0, -1.0))
         return "have the wrong sign", "change the sign of east and north", repair
-    return "do not follow the positions", "leave the velocities out", _without_velocities
+    left_out = changed("gnss", dataclasses.replace, velocity_enu_mps=None, sigma_v_mps=None)
+    return "do not follow the positions", "leave the velocities out", left_out
 
 
-def _velocities(
-    recording: Recording,
-    *,
-    scale: float = 1.0,
-    swap: bool = False,
-    signs: tuple[float, float] = (1.0, 1.0),
-) -> Recording:
-    gnss = recording.gnss
-    assert gnss is not None
-    assert gnss.velocity_enu_mps is not None
-    velocity = gnss.velocity_enu_mps[:, [1, 0, 2]] if swap else gnss.velocity_enu_mps
-    velocity = velocity * (scale * signs[0], scale * signs[1], scale)
-    sigma = None if gnss.sigma_v_mps is None else gnss.sigma_v_mps * scale
-    return with_fields(recording, "gnss", velocity_enu_mps=velocity, sigma_v_mps=sigma)
+def _velocities(scale: float = 1.0, *, swap: bool = False, signs: tuple[float, float] = (1.0, 1.0)) -> Repair:
+    """A repair that scales the velocities, swaps east and north, and changes their signs."""
 
+    def repaired(gnss: Gnss) -> Gnss:
+        assert gnss.velocity_enu_mps is not None
+        velocity = gnss.velocity_enu_mps[:, [1, 0, 2]] if swap else gnss.velocity_enu_mps
+        velocity = velocity * (scale * signs[0], scale * signs[1], scale)
+        sigma = None if gnss.sigma_v_mps is None else gnss.sigma_v_mps * scale
+        return dataclasses.replace(gnss, velocity_enu_mps=velocity, sigma_v_mps=sigma)
 
-def _without_velocities(recording: Recording) -> Recording:
-    return with_fields(recording, "gnss", velocity_enu_mps=None, sigma_v_mps=None)
+    return changed("gnss", repaired)
 
 
 def reflection(recording: Recording) -> tuple[str, Repair]:
@@ -210,12 +203,10 @@ def reflection(recording: Recording) -> tuple[str, Repair]:
         fix = "swap east and north, as the velocities show"
     else:
         fix = f"change the sign of {axis}, as the velocities show"
-    return fix, partial(_positions, swap=axis in (None, "swap"), signs=SIGNS[axis or "swap"])
+    return fix, changed("gnss", _reflected, swap=axis in (None, "swap"), signs=SIGNS[axis or "swap"])
 
 
-def _positions(recording: Recording, swap: bool, signs: tuple[float, float]) -> Recording:
-    gnss = recording.gnss
-    assert gnss is not None
+def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float]) -> Gnss:
     order = [1, 0, 2] if swap else [0, 1, 2]
     enu, sigma = gnss.enu_m[:, order] * (*signs, 1.0), gnss.sigma_enu_m[:, order]
-    return with_fields(recording, "gnss", enu_m=enu, sigma_enu_m=sigma)
+    return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma)

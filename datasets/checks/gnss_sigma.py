@@ -5,17 +5,16 @@ to the east and to the north, and twice it for the height (the public NMEA drive
 into the covariance). It describes the geometry of the satellites, not metres.
 """
 
+import dataclasses
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, scaled, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, scaled
 from terrafusion.datasets.checks.motion import typical_sigma
 from terrafusion.datasets.checks.path import scatter_m
 from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
-from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 
 OVERCONFIDENT, LEAST_SCATTER_M = 5.0, 0.03
@@ -45,7 +44,7 @@ def check_sigma(context: CheckContext) -> Iterator[Finding]:
         f"first at t = {context.since_start_s(gnss.t_ns[first]):.2f} s: {gnss.sigma_enu_m[first].tolist()} m",
         "use the median of the other fixes of the class; where there is none, the usual value "
         f"({usual} m, heights twice), or the scatter about wheels and gyro where that is larger",
-        partial(_with_usual_sigma, least_m=scatter_m(context) or 0.0),
+        changed("gnss", _with_usual_sigma, least_m=scatter_m(context) or 0.0),
     )  # fmt: skip
 
 
@@ -56,9 +55,7 @@ def _impossible(gnss: Gnss) -> Mask:
     return np.asarray(counts & ~(gnss.sigma_enu_m > 0.0))
 
 
-def _with_usual_sigma(recording: Recording, least_m: float) -> Recording:
-    gnss = recording.gnss
-    assert gnss is not None
+def _with_usual_sigma(gnss: Gnss, least_m: float) -> Gnss:
     sigma, bad = gnss.sigma_enu_m.copy(), _impossible(gnss)
     for fix in np.unique(gnss.fix).tolist():
         usual = max(ASSUMED_SIGMA_M[Fix(fix)], least_m)
@@ -67,7 +64,7 @@ def _with_usual_sigma(recording: Recording, least_m: float) -> Recording:
             good = sigma[of_class & (sigma[:, k] > 0.0), k]
             value = float(np.median(good)) if len(good) >= 10 else factor * usual
             sigma[of_class & bad[:, k], k] = value
-    return with_fields(recording, "gnss", sigma_enu_m=sigma)
+    return dataclasses.replace(gnss, sigma_enu_m=sigma)
 
 
 def check_velocity_sigma(context: CheckContext) -> Iterator[Finding]:
@@ -86,7 +83,7 @@ def check_velocity_sigma(context: CheckContext) -> Iterator[Finding]:
         f"{int(bad.sum())} of {int(measured.sum())} velocities have a sigma that is zero or negative",
         f"first at t = {context.since_start_s(gnss.t_ns[first]):.2f} s: {gnss.sigma_v_mps[first]:g} m/s",
         "leave these velocities out, or give the receiver's own sigma in m/s",
-        lambda recording: with_fields(recording, "gnss", velocity_enu_mps=velocity),
+        changed("gnss", dataclasses.replace, velocity_enu_mps=velocity),
     )  # fmt: skip
 
 
@@ -136,7 +133,7 @@ def check_dilution(context: CheckContext) -> Iterator[Finding]:
         "as metres they would be those of a receiver good to 1 m; give the accuracy of yours"
         if same
         else f"multiply them by the accuracy assumed for the class ({usual}); better, give the receiver's",
-        None if same else _times_class_sigma,
+        None if same else changed("gnss", _times_class_sigma),
     )  # fmt: skip
 
 
@@ -160,9 +157,7 @@ def _in_steps(sigma: Array) -> bool:
     )
 
 
-def _times_class_sigma(recording: Recording) -> Recording:
-    gnss = recording.gnss
-    assert gnss is not None
+def _times_class_sigma(gnss: Gnss) -> Gnss:
     usual = np.array([ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])[gnss.fix]
     sigma = np.where(_with_sigma(gnss)[:, None], gnss.sigma_enu_m * usual[:, None], gnss.sigma_enu_m)
-    return with_fields(recording, "gnss", sigma_enu_m=sigma)
+    return dataclasses.replace(gnss, sigma_enu_m=sigma)

@@ -17,6 +17,7 @@ from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
     Repair,
+    changed,
     changed_field,
     once,
     scaled,
@@ -329,14 +330,13 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     off = abs(np.angle(np.exp(1j * (angle - 0.5 * np.pi * quarter))))
     axes = {1: ("-y", "+x", "+z"), 2: ("-x", "-y", "+z"), 3: ("+y", "-x", "+z")}.get(quarter, ())
     near = bool(axes) and off < NEAR_AXIS
-    fix, repair = "give the IMU's mounting", None
+    fix = "give the IMU's mounting"
+    repair: Repair | None = None
     if near:
         fix, repair = _pointing("IMU", axes), partial(_turned, axes=axes, gyro=True)
     elif sure:
-        fix, repair = (
-            f"turn the IMU by {np.degrees(-angle):.0f} deg about z",
-            partial(_turned_by, angle=angle),
-        )
+        fix = f"turn the IMU by {np.degrees(-angle):.0f} deg about z"
+        repair = changed("imu", _turned_by, angle=angle)
     interval = f" +- {np.degrees(found.spread):.0f}" if np.isfinite(found.spread) else ""
     yield Finding(
         "imu-forward", "error" if near else "warning", "imu",
@@ -348,18 +348,13 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _turned_by(recording: Recording, angle: float) -> Recording:
-    """The recording of an IMU that is turned by `angle` (rad) about z, to the left, in body axes."""
-    imu = recording.imu
-    assert imu is not None
-    turn = np.array(
-        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
-    )
-    with_z = {"gyro_radps": imu.gyro_radps, "accel_mps2": imu.accel_mps2}
-    turned = {name: values.copy() for name, values in with_z.items()}
-    for name, values in turned.items():
-        values[:, :2] = with_z[name][:, :2] @ turn[:2, :2].T
-    return with_fields(recording, "imu", **turned)
+def _turned_by(imu: Imu, angle: float) -> Imu:
+    """The readings in body axes of an IMU that is turned by `angle` (rad) about z, to the left."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    gyro, accel = imu.gyro_radps.copy(), imu.accel_mps2.copy()
+    for values in (gyro, accel):
+        values[:, :2] = values[:, :2] @ turn.T
+    return Imu(imu.t_ns, gyro, accel)
 
 
 def _pointing(sensor: str, axes: Axes) -> str:

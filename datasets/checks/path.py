@@ -123,8 +123,10 @@ def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, 
     return t, cumulative(t, v, unsigned=True), cumulative(t, v * ahead) + point_m * ahead
 
 
-def fit_windows(context: CheckContext, measured: MeasuredPath) -> PathFits | None:
+def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFits | None:
     """Fit the dead-reckoned path to the positions window by window; None where too few are usable."""
+    if measured is None:
+        return None
     reckoned = dead_reckoned(context, antenna(context) if measured.source == "gnss" else 0j)
     if reckoned is None:
         return None
@@ -203,6 +205,5 @@ def scales(context: CheckContext) -> list[tuple[PathScale, PathFits]]:
 
 def scatter_m(context: CheckContext) -> float | None:
     """Scatter of the fixes about the dead-reckoned path, 1 sigma along one axis, without slow errors."""
-    path = path_by(context.recording, "gnss")
-    fits = fit_windows(context, path) if path is not None else None
+    fits = fit_windows(context, path_by(context.recording, "gnss"))
     return float(np.median(fits.scatter_m)) if fits is not None else None

@@ -43,7 +43,6 @@ class PathModel:
     gyro_scale: BootstrapInterval
     delay_s: BootstrapInterval
     windows: int
-    source: str
 
 
 @dataclass(frozen=True)
@@ -91,9 +90,9 @@ def _real(columns: Complex) -> Array:
     return np.concatenate([columns.real, columns.imag])
 
 
-def path_model(context: CheckContext, measured: MeasuredPath) -> PathModel | None:
+def path_model(context: CheckContext, measured: MeasuredPath | None) -> PathModel | None:
     """Fit it; None where wheels, gyro or windows are too few, or the paths are unlike."""
-    windows = _windows(context, measured)
+    windows = _windows(context, measured) if measured is not None else None
     if windows is None:
         return None
     starts = [(_rest(windows, delay), delay) for delay in STARTS_S.tolist()]
@@ -119,7 +118,7 @@ def path_model(context: CheckContext, measured: MeasuredPath) -> PathModel | Non
         else BootstrapInterval(float(unknown[k]), -np.inf, np.inf)
         for k in range(2)
     )
-    return PathModel(scale, delay, len(H), measured.source)
+    return PathModel(scale, delay, len(H))
 
 
 def _contributing(information: Array) -> float:

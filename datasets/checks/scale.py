@@ -218,8 +218,7 @@ def _by_truth(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
 
 def _by_path(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
     for source, name in (("gnss", "the path of the fixes"), ("truth", "the path of the truth")):
-        path = path_by(context.recording, source)
-        model = path_model(context, path) if path is not None else None
+        model = path_model(context, path_by(context.recording, source))
         if model is not None and model.windows >= PATH_WINDOWS:
             return model.gyro_scale, name
     return None

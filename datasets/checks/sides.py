@@ -1,12 +1,12 @@
 """Left against right: sides sampled at different times, and one wheel smaller than the other."""
 
+import dataclasses
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
-from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed
 from terrafusion.datasets.checks.imu import at_rest
 from terrafusion.datasets.checks.motion import (
     Integral,
@@ -20,8 +20,8 @@ from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import resampled_rows
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
-from terrafusion.datasets.core.recording import Recording
 
 WINDOW_S, BLOCK, LEAST_BLOCKS = 1.0, 10, 8
 """Rates are averaged over windows; as many of them are one block of the bootstrap."""
@@ -68,7 +68,7 @@ def check_radii(context: CheckContext) -> Iterator[Finding]:
         f"{fast} rolls {abs(found.value):.1%} further than {slow} where the gyro shows no turn",
         f"95 % interval {ends[0]:.1%} to {ends[1]:.1%}: a deflated tyre, or another radius",
         f"multiply the {side} speeds by {factor:.4f}",
-        partial(_scaled, side=side, factor=factor),
+        changed("wheels", _scaled, side=side, factor=factor),
     )  # fmt: skip
 
 
@@ -128,9 +128,7 @@ def _rolled(context: CheckContext) -> Integral | None:
     return None if driven is None else Integral(driven[0], cumulative(*driven))
 
 
-def _scaled(recording: Recording, side: str, factor: float) -> Recording:
-    wheels = recording.wheels
-    assert wheels is not None
+def _scaled(wheels: Wheels, side: str, factor: float) -> Wheels:
     factors: Array = np.array([factor if side in name else 1.0 for name in wheels.names])
     angle = None if wheels.angle_rad is None else wheels.angle_rad * factors
-    return with_fields(recording, "wheels", speed=wheels.speed * factors, angle_rad=angle)
+    return dataclasses.replace(wheels, speed=wheels.speed * factors, angle_rad=angle)

@@ -234,13 +234,11 @@ def without_cells(cells: list[tuple[str, Mask]], channel: str) -> Repair:
     if channel == "wheels":
         return without_rows(channel, np.logical_or.reduce([mask.any(axis=1) for _, mask in cells]))
 
-    def emptied(recording: Recording) -> Recording:
-        imu = recording.imu
-        return with_fields(
-            recording, "imu", **{field: np.where(mask, np.nan, getattr(imu, field)) for field, mask in cells}
-        )
+    def emptied(imu: Imu) -> Imu:
+        values = {field: np.where(mask, np.nan, getattr(imu, field)) for field, mask in cells}
+        return dataclasses.replace(imu, **values)
 
-    return emptied
+    return changed(channel, emptied)
 
 
 def check_dead(context: CheckContext) -> Iterator[Finding]:

@@ -6,11 +6,12 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, with_fields
 from terrafusion.datasets.checks.motion import on_plane, seconds, wheel_speed
 from terrafusion.datasets.checks.path import fit_windows, path_by
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 
 CHORD_S, LEAST_CHORD_M = 1.0, 0.2
 LEAST_CHORDS, LEAST_R = 20, 0.95
@@ -32,7 +33,7 @@ def check_yaw(context: CheckContext) -> Iterator[Finding]:
         f"the truth's yaw is {np.degrees(angle):.0f} deg off its course",
         f"mean over {chords} chords of {CHORD_S:g} s on which the wheels run; resultant length {r:.2f}",
         f"turn its body frame by {-np.degrees(angle):.0f} deg about z",
-        partial(_turned, angle=-angle),
+        changed("truth", _turned, angle=-angle),
     )  # fmt: skip
 
 
@@ -66,12 +67,10 @@ def yaw_offset(context: CheckContext) -> tuple[float, int, float] | None:
     return (float(np.angle(mean)), int(use.sum()), abs(mean)) if abs(mean) > LEAST_R else None
 
 
-def _turned(recording: Recording, angle: float) -> Recording:
+def _turned(truth: Trajectory, angle: float) -> Trajectory:
     """The truth with its body frame turned by `angle` about its own z."""
     from scipy.spatial.transform import Rotation
 
-    truth = recording.truth
-    assert truth is not None
     assert truth.quaternion is not None
     known = np.isfinite(truth.quaternion).all(axis=1)
     quaternion = truth.quaternion.copy()
@@ -80,13 +79,12 @@ def _turned(recording: Recording, angle: float) -> Recording:
     twist = truth.twist_body
     if twist is not None:
         twist = np.hstack([twist[:, :3] @ turn.as_matrix(), twist[:, 3:] @ turn.as_matrix()])
-    return with_fields(recording, "truth", quaternion=quaternion, twist_body=twist)
+    return dataclasses.replace(truth, quaternion=quaternion, twist_body=twist)
 
 
 def check_unit(context: CheckContext) -> Iterator[Finding]:
     """The truth's positions must be metres."""
-    path = path_by(context.recording, "truth")
-    fits = fit_windows(context, path) if path is not None else None
+    fits = fit_windows(context, path_by(context.recording, "truth"))
     if fits is None:
         return
     ratio = float(np.median(fits.span_ratio))

@@ -1,11 +1,12 @@
 """The wheels compared with each other, and their sign compared with the motion of the robot."""
 
+import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed
 from terrafusion.datasets.checks.imu import gravity, heading, wheels_turn_backwards
 from terrafusion.datasets.checks.motion import (
     ANY_RADIUS_M,
@@ -22,7 +23,7 @@ from terrafusion.datasets.checks.motion import (
 from terrafusion.datasets.checks.path import measured_paths
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Imu
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
 
@@ -55,7 +56,7 @@ def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
             f"{wheels.names[wheel].replace('_', ' ')} does not run as the other wheel of its side",
             evidence,
             f"multiply its speed by {factor:.3g}" if factor else "use the other wheel of the side for it",
-            partial(_one_wheel, wheel=wheel, partner=partner, factor=factor),
+            changed("wheels", _one_wheel, wheel=wheel, partner=partner, factor=factor),
         )  # fmt: skip
 
 
@@ -83,11 +84,10 @@ def _odd_one(speed: Array, power: Array, front: int, rear: int) -> tuple[int, in
     return None
 
 
-def _one_wheel(recording: Recording, wheel: int, partner: int, factor: float | None) -> Recording:
-    assert recording.wheels is not None
-    speed = recording.wheels.speed.copy()
+def _one_wheel(wheels: Wheels, wheel: int, partner: int, factor: float | None) -> Wheels:
+    speed = wheels.speed.copy()
     speed[:, wheel] = speed[:, partner] if factor is None else speed[:, wheel] * factor
-    return with_fields(recording, "wheels", speed=speed, angle_rad=None)
+    return dataclasses.replace(wheels, speed=speed, angle_rad=None)
 
 
 def check_wheel_signs(context: CheckContext) -> Iterator[Finding]:

@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from terrafusion.datasets.core.display import CLOCK_COLUMNS, clock_line, clock_rows, table_html
-from terrafusion.datasets.core.messages import (
-    Message,
-)
+from terrafusion.datasets.core.messages import Message
 from terrafusion.datasets.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import (
     Barometer,
     Channel,
@@ -117,12 +116,16 @@ class Recording:
         found = {name: getattr(self, name) for name in self.CHANNELS}
         return {name: channel for name, channel in found.items() if channel is not None and len(channel)}
 
+    def clocks(self) -> dict[str, TimesNs]:
+        """Times (N,) of the channels that are present, and of the truth, by name."""
+        clocks = {name: channel.t_ns for name, channel in self.channels().items()}
+        if self.truth is not None and len(self.truth):
+            clocks["truth"] = self.truth.t_ns
+        return clocks
+
     def end_ns(self) -> int:
         """Time of the last sample of any channel."""
-        ends = [int(channel.t_ns[-1]) for channel in self.channels().values()]
-        if self.truth is not None and len(self.truth):
-            ends.append(int(self.truth.t_ns[-1]))
-        return max(ends, default=self.start_ns)
+        return max((int(t_ns[-1]) for t_ns in self.clocks().values()), default=self.start_ns)
 
     def duration_s(self) -> float:
         """Seconds from `start_ns` to the last sample."""
@@ -154,10 +157,7 @@ class Recording:
         return f"Recording '{self.name}': {robot}{ground}, {self.duration_s():.1f} s, {len(self.notes)} notes"
 
     def _rows(self) -> list[tuple[str, ...]]:
-        clocks = {name: channel.t_ns for name, channel in self.channels().items()}
-        if self.truth is not None and len(self.truth):
-            clocks["truth"] = self.truth.t_ns
-        return clock_rows(clocks, self.start_ns)
+        return clock_rows(self.clocks(), self.start_ns)
 
     def with_notes(self, *notes: str) -> Recording:
         """The same recording with further notes."""
