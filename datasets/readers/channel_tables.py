@@ -177,7 +177,7 @@ class ChannelReader:
         return Terrain(
             self._t(table),
             table.texts["label"],
-            self.meta.texts.get("terrain_source", "annotation"),
+            "annotation" if self.meta.terrain_source is None else self.meta.terrain_source,
             tuple(name.removeprefix("p_") for name in table.numbers),
             table.stack(list(table.numbers)) if table.numbers else None,
         )

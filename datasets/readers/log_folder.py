@@ -15,7 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import ClockError, DataError
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import ChannelReader
 from terrafusion.datasets.readers.csv_table import CsvTable, read_table, read_times
@@ -94,23 +94,21 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         name: of the recording where `meta` gives none.
         notes: of the reader; those that the log already has are not repeated.
     """
+    truth, contents = channels["truth"], meta.truth_channels
+    if contents is None:
+        contents = () if truth is None else truth_contents(truth)
+    same = ("start_ns", "vehicle", "datum", "truth_frame", "metadata")
+    texts = ("description", "licence", "source", "imu_frame_id")
     return Recording(
-        name=meta.texts.get("name", name),
-        start_ns=meta.start_ns,
-        vehicle=meta.texts.get("vehicle"),
+        name=name if meta.name is None else meta.name,
         **channels,
-        datum=meta.datum,
-        truth_channels=_truth_channels(meta, channels["truth"]),
-        truth_frame=meta.truth_frame,
-        overrides=meta.overrides,
-        description=meta.texts.get("description", ""),
-        terrain_name=meta.texts.get("terrain", ""),
-        licence=meta.texts.get("licence", ""),
-        source=meta.texts.get("source", ""),
+        **{key: getattr(meta, key) for key in same},
+        **{key: getattr(meta, key) or "" for key in texts},
+        terrain_name=meta.terrain or "",
+        truth_channels=contents,
+        overrides=meta.overrides(),
         notes=(*meta.notes, *(note for note in notes if note not in meta.notes)),
-        clock_jumps=meta.clock_jumps,
-        imu_frame_id=meta.texts.get("imu_frame_id", ""),
-        metadata=meta.metadata,
+        clock_jumps=tuple(ClockJump(**vars(jump)) for jump in meta.clock_jumps),
     )
 
 
@@ -170,23 +168,12 @@ class _Folder:
             yield f"{path.name} is not a channel of the format and was not read{meant}"
 
 
-def _truth_channels(meta: Meta, truth: Trajectory | None) -> tuple[str, ...]:
-    """What meta.yaml says the truth holds, else what its columns hold."""
-    if meta.truth_channels is not None:
-        return meta.truth_channels
-    return () if truth is None else truth_contents(truth)
-
-
-def _is_tilted(truth: Trajectory) -> bool:
-    q = truth.quaternion
-    return q is not None and bool(np.nanmax(np.abs(q[:, :2]), initial=0.0) > 0.0)
-
-
 def truth_contents(truth: Trajectory) -> tuple[str, ...]:
     """Names of what a trajectory holds: position, yaw, orientation (more than yaw), velocity."""
     found = ["position"]
     if truth.quaternion is not None:
-        found += ["yaw", "orientation"] if _is_tilted(truth) else ["yaw"]
+        tilted = np.nanmax(np.abs(truth.quaternion[:, :2]), initial=0.0) > 0.0
+        found += ["yaw", "orientation"] if tilted else ["yaw"]
     if truth.twist_body is not None and not np.isnan(truth.twist_body[:, :2]).all():
         found.append("velocity")
     return tuple(found)

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.config import Prepared, structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
-from terrafusion.datasets.core.recording import ClockJump, Overrides
+from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.scratch import UNFINISHED
 from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.yaml_file import read_yaml
@@ -83,31 +83,25 @@ class MetaFile(DescriptionFile):
 
 
 KEYS = tuple(field.name for field in dataclasses.fields(MetaFile))
-TEXT_KEYS = KEYS[:8]
 OTHER_UNITS = ("mm", "cm", "km", "in", "ft")
 """Lengths in these are refused: left out, the vehicle's own number would take their place unseen."""
 
 
-@dataclass(frozen=True)
-class Meta:
-    """What `meta.yaml` says.
+@dataclass(frozen=True, kw_only=True)
+class Meta(MetaFile):
+    """What `meta.yaml` says: its keys, and what it is worth.
 
     `truth_channels` is None where the file does not tell, `notes` are those of the log, `remarks`
     what was odd about the file, `metadata` its unknown keys; with `keep_empty` rows and tables without a
     value are kept.
     """
 
-    start_ns: int
-    texts: dict[str, str] = field(default_factory=dict)
-    overrides: Overrides = field(default_factory=Overrides)
-    datum: tuple[float, float, float] | None = None
-    truth_channels: tuple[str, ...] | None = None
-    truth_frame: str = "base"
-    notes: tuple[str, ...] = ()
-    clock_jumps: tuple[ClockJump, ...] = ()
-    keep_empty: bool = False
     remarks: tuple[str, ...] = ()
     metadata: dict[str, Any] = field(default_factory=dict)
+
+    def overrides(self) -> Overrides:
+        """The robot's geometry, as far as the log states it."""
+        return Overrides(**{key.name: getattr(self, key.name) for key in dataclasses.fields(Overrides)})
 
 
 def read_meta(path: Path) -> Meta:
@@ -134,19 +128,7 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
     if strange:
         known = ", ".join(TRUTH_CHANNELS)
         remarks.append(f"meta.yaml: truth channels {', '.join(strange)} are not used; known are {known}")
-    return Meta(
-        start_ns=file.start_ns,
-        texts={key: getattr(file, key) for key in TEXT_KEYS if key in given},
-        overrides=Overrides(**{key.name: getattr(file, key.name) for key in dataclasses.fields(Overrides)}),
-        datum=file.datum,
-        truth_channels=file.truth_channels,
-        truth_frame=file.truth_frame,
-        notes=file.notes,
-        clock_jumps=tuple(ClockJump(jump.channel, jump.t_ns, jump.step_s) for jump in file.clock_jumps),
-        keep_empty=file.keep_empty,
-        remarks=tuple(remarks),
-        metadata=finite(unknown),
-    )
+    return Meta(**vars(file), remarks=tuple(remarks), metadata=finite(unknown))
 
 
 def _is_extra(key: str, given: Mapping[str, Any]) -> bool:

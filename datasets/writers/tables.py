@@ -25,6 +25,7 @@ from terrafusion.datasets.readers.channel_tables import (
 from terrafusion.datasets.readers.log_meta import parse_meta
 
 PLANAR_TWIST = ("u_mps", "v_mps", "r_radps")
+NUMBERS = ("wheel_radius_m", "track_m", "drive", "wheelbase_m", "steering_ratio")
 
 
 @contextmanager
@@ -110,22 +111,15 @@ def meta_of(recording: Recording, file: Path, name: str) -> dict[str, Any]:
     """
     r, o = recording, recording.overrides
     source = r.terrain.source if r.terrain is not None else "annotation"
+    places = {"antenna_m": o.antenna_m, "imu_m": o.imu_m, "datum": r.datum}
     meta: dict[str, Any] = {
         "name": r.name if r.name != name else None,
         "start_ns": int(r.start_ns),
         "vehicle": r.vehicle,
         "terrain": r.terrain_name or None,
-        "description": r.description or None,
-        "licence": r.licence or None,
-        "source": r.source or None,
-        "wheel_radius_m": o.wheel_radius_m,
-        "track_m": o.track_m,
-        "drive": o.drive,
-        "wheelbase_m": o.wheelbase_m,
-        "steering_ratio": o.steering_ratio,
-        "antenna_m": o.antenna_m and [float(x) for x in o.antenna_m],
-        "imu_m": o.imu_m and [float(x) for x in o.imu_m],
-        "datum": r.datum and [float(x) for x in r.datum],
+        **{key: getattr(r, key) or None for key in ("description", "licence", "source")},
+        **{key: getattr(o, key) for key in NUMBERS},
+        **{key: place and [float(x) for x in place] for key, place in places.items()},
         "truth_channels": list(r.truth_channels) if r.truth is not None or r.truth_channels else None,
         "truth_frame": r.truth_frame if r.truth_frame != "base" else None,
         "terrain_source": source if source != "annotation" else None,

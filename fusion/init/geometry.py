@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from operator import attrgetter
 
 from terrafusion.datasets.checks.measures import Measures, SpeedRatio, YawFit
 from terrafusion.datasets.core.errors import DataError
@@ -29,32 +30,28 @@ FLAGS = {
     "mass_kg": "--mass",
     "drive": "--drive",
 }
+USUAL = {
+    "wheel_radius_m": "odometry.wheel_radius_m",
+    "track_m": "odometry.track_m",
+    "wheelbase_m": "body.wheelbase_m",
+    "antenna_m": "sensors.gnss.antenna_m",
+    "imu_m": "sensors.imu.position_m",
+    "mass_kg": "body.mass_kg",
+}
+"""Where a vehicle has the number that is assumed of another robot."""
 
 
 def geometry_lines(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
     """The lines of drive, track, sensors' places and mass; the arguments as in `radius_line`."""
     drive = _drive(recording, answers, base)
-    lines = {"drive": drive}
-    lines |= _track(recording, measured.yaw, answers, base, str(drive.value))
-    if drive.value in STEERED_DRIVES:
-        lines["wheelbase_m"] = _given(
-            "wheelbase_m",
-            answers.wheelbase_m,
-            recording.overrides.wheelbase_m,
-            base.body.wheelbase_m,
-            "m",
-            base,
-        )
-    if recording.gnss is not None:
-        place = base.sensors.gnss.antenna_m
-        lines["antenna_m"] = _given(
-            "antenna_m", answers.antenna_m, recording.overrides.antenna_m, place, "m", base
-        )
-    if imu_kind(recording.imu) == "six_axis":
-        place = base.sensors.imu.position_m
-        lines["imu_m"] = _given("imu_m", answers.imu_m, recording.overrides.imu_m, place, "m", base)
-    lines["mass_kg"] = _given("mass_kg", answers.mass_kg, None, base.body.mass_kg, "kg", base)
-    return lines
+    others = {
+        "wheelbase_m": drive.value in STEERED_DRIVES,
+        "antenna_m": recording.gnss is not None,
+        "imu_m": imu_kind(recording.imu) == "six_axis",
+        "mass_kg": True,
+    }
+    lines = {"drive": drive} | _track(recording, measured.yaw, answers, base, str(drive.value))
+    return lines | {name: _given(name, recording, answers, base) for name, wanted in others.items() if wanted}
 
 
 def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> DraftLine:
@@ -102,7 +99,7 @@ def radius_line(recording: Recording, measured: Measures, answers: Answers, base
         return {
             name: DraftLine(number, f"m; path of the {source} over that of the wheels, usual slip included")
         }
-    return {name: _given(name, given, stated, base.odometry.wheel_radius_m, "m", base)}
+    return {name: _given(name, recording, answers, base)}
 
 
 def best_ratio(measured: Measures) -> tuple[str, SpeedRatio] | None:
@@ -120,7 +117,7 @@ def _track(
     stated = recording.overrides.track_m
     effective = yaw.effective_track_m if yaw is not None and drive not in STEERED_DRIVES else None
     if effective is None or yaw is None:
-        return {"track_m": _given("track_m", answers.track_m, stated, base.odometry.track_m, "m", base)}
+        return {"track_m": _given("track_m", recording, answers, base)}
     windows = max(yaw.seconds / 0.5 - 2.0, 1.0)
     share = max(math.sqrt((1.0 / yaw.r**2 - 1.0) / windows), LEAST_TRACK_SIGMA)
     logs = (recording.name,)
@@ -128,7 +125,7 @@ def _track(
         number = KnownNumber(round(effective, 4), "calibrated", round(share * effective, 4), logs)
         line = DraftLine(number, "m; side speeds against the gyro")
     else:
-        line = _given("track_m", answers.track_m, stated, base.odometry.track_m, "m", base)
+        line = _given("track_m", recording, answers, base)
     assert isinstance(line.value, KnownNumber)
     factor = line.value.number / effective
     if not LEAST_FACTOR < factor < MOST_FACTOR:
@@ -138,26 +135,20 @@ def _track(
     return {"track_m": line, "yaw_factor": DraftLine(known, comment)}
 
 
-def _given(
-    name: str,
-    answer: KnownNumber | None,
-    stated: float | tuple[float, ...] | None,
-    usual: float | tuple[float, ...],
-    unit: str,
-    base: VehicleParams,
-) -> DraftLine:
+def _given(name: str, recording: Recording, answers: Answers, base: VehicleParams) -> DraftLine:
     """The line of a number by the first who knows it: the log, the user; else the assumption."""
-    axes = "; forward, left, up" if isinstance(usual, tuple) else ""
+    answer, stated = getattr(answers, name), getattr(recording.overrides, name, None)
+    usual = attrgetter(USUAL[name])(base)
+    unit = name.rpartition("_")[2] + ("; forward, left, up" if isinstance(usual, tuple) else "")
     if answer is not None:
-        other = (
-            f"; the log states {stated}, which counts for it" if stated not in (None, answer.value) else ""
-        )
-        return DraftLine(answer, f"{unit}{axes}; given{other}")
+        counts = stated not in (None, answer.value)
+        other = f"; the log states {stated}, which counts for it" if counts else ""
+        return DraftLine(answer, f"{unit}; given{other}")
     if stated is not None:
         value = tuple(round(v, 6) for v in stated) if isinstance(stated, tuple) else round(stated, 6)
-        return DraftLine(KnownNumber(value, "assumed"), f"{unit}{axes}; as the log states")
+        return DraftLine(KnownNumber(value, "assumed"), f"{unit}; as the log states")
     spread = f" +- {NUMBERS[name].sigma:g}" if name in NUMBERS else ""
-    words = f"{unit}{axes}; assumed{spread}, as of '{base.name}'; else give {FLAGS[name]}"
+    words = f"{unit}; assumed{spread}, as of '{base.name}'; else give {FLAGS[name]}"
     return DraftLine(KnownNumber(usual, "assumed"), words + ("; only the twin uses it" * (name == "mass_kg")))
 
 

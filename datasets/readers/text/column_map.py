@@ -126,7 +126,7 @@ class ColumnMap:
     header: str = "line"
     imu_axes: tuple[str, ...] = BODY_AXES
     held: dict[str, float] = field(default_factory=dict)
-    meta: Meta = field(default_factory=lambda: Meta(0))
+    meta: Meta = field(default_factory=lambda: Meta(start_ns=0))
 
     def conventions(self) -> Conventions:
         """What is to be applied to the channels after reading."""
