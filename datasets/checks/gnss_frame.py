@@ -7,15 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, with_fields
-from terrafusion.datasets.checks.motion import (
-    course_agreement,
-    cumulative,
-    gyro_angle,
-    on_plane,
-    seconds,
-    typical_sigma,
-)
 from terrafusion.datasets.checks.path import fit_windows, path_by
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.frames import geodetic_to_enu
@@ -60,11 +53,11 @@ def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tupl
     known = np.abs(gnss.enu_m[np.isfinite(gnss.enu_m[:, :2]).all(axis=1), :2]) * to_degrees
     if known.max(axis=0).max() > 90.0:
         return bool(known[:, 1].max() > 90.0), False
-    yaw = gyro_angle(context.recording)
+    yaw = motion.gyro_angle(context.recording)
     metric = _to_metres(context.recording, to_degrees, swapped=False).gnss
     if yaw is None or metric is None:
         return False, True
-    both = course_agreement(yaw, metric, context.recording.start_ns)
+    both = motion.course_agreement(yaw, metric, context.recording.start_ns)
     if both is None or abs(both.r) < SURE_R:
         return False, True
     return both.r < 0.0, False
@@ -112,20 +105,20 @@ def velocity_fit(gnss: Gnss) -> VelocityFit | None:
     """The receiver's velocities against its positions; None where it gives none, or hardly moves."""
     if gnss.velocity_enu_mps is None:
         return None
-    velocity, place = on_plane(gnss.velocity_enu_mps), on_plane(gnss.enu_m)
+    velocity, place = motion.on_plane(gnss.velocity_enu_mps), motion.on_plane(gnss.enu_m)
     known = np.isfinite(velocity) & np.isfinite(place) & (gnss.fix > 0)
     if known.sum() < 20:
         return None
-    t, velocity, place = seconds(gnss.t_ns[known], int(gnss.t_ns[0])), velocity[known], place[known]
+    t, velocity, place = motion.seconds(gnss.t_ns[known], int(gnss.t_ns[0])), velocity[known], place[known]
     if t[-1] <= t[0]:
         return None
-    sigma = typical_sigma(gnss)
+    sigma = motion.typical_sigma(gnss)
     spread = float(np.abs(place - place.mean()).max())
     if spread < max(2.0, 10.0 * sigma):
         return None
     pace = spread / (t[-1] - t[0])
     grid = np.arange(t[0], t[-1], float(np.clip(10.0 * sigma / max(pace, 1e-3), *CHORD_S)))
-    u, v = np.diff(np.interp(grid, t, place)), np.diff(np.interp(grid, t, cumulative(t, velocity)))
+    u, v = np.diff(np.interp(grid, t, place)), np.diff(np.interp(grid, t, motion.cumulative(t, velocity)))
     uu, vv = float(np.sum(np.abs(u) ** 2)), float(np.sum(np.abs(v) ** 2))
     if len(u) < 8 or np.sqrt(uu / len(u)) < max(0.05, 5.0 * sigma):
         return None
@@ -154,8 +147,8 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
 
 def _positions_mirrored(context: CheckContext, gnss: Gnss) -> bool:
     """Whether the positions turn against the gyro: see yaw_agreement.check_turns."""
-    yaw = gyro_angle(context.recording)
-    both = course_agreement(yaw, gnss, context.recording.start_ns) if yaw is not None else None
+    yaw = motion.gyro_angle(context.recording)
+    both = motion.course_agreement(yaw, gnss, context.recording.start_ns) if yaw is not None else None
     return both is not None and both.r < -0.5
 
 

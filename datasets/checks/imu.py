@@ -12,6 +12,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
 from terrafusion.datasets.checks.finding import (
     CheckContext,
@@ -22,16 +23,6 @@ from terrafusion.datasets.checks.finding import (
     once,
     scaled,
     with_fields,
-)
-from terrafusion.datasets.checks.motion import (
-    Integral,
-    agreement,
-    cumulative,
-    gyro_angle,
-    integral,
-    runs,
-    wheel_speed,
-    yaw_angles,
 )
 from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
@@ -176,7 +167,7 @@ def at_rest(context: CheckContext) -> NDArray[np.bool_]:
     if wheels is None or imu is None or len(wheels) < 2:
         return np.zeros(0 if imu is None else len(imu), dtype=bool)
     top = np.nanmax(np.abs(wheels.speed), initial=0.0) if np.isfinite(wheels.speed).any() else 0.0
-    first, after = runs(np.asarray((np.abs(wheels.speed) <= 1e-3 * top).all(axis=1)))
+    first, after = motion.runs(np.asarray((np.abs(wheels.speed) <= 1e-3 * top).all(axis=1)))
     begins, ends = wheels.t_ns[first], wheels.t_ns[after - 1]
     steps = np.diff(wheels.t_ns)
     gaps = wheels.t_ns[:-1][steps > max(GAP_PERIODS * float(np.median(steps)), GAP_S * 1e9)]
@@ -219,11 +210,13 @@ def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> ForceHea
         None where the run is too short, too even or too noisy.
     """
     imu, start = context.recording.imu, context.recording.start_ns
-    driven = wheel_speed(context)
+    driven = motion.wheel_speed(context)
     if imu is None or driven is None:
         return None
-    columns = [integral(start, imu.t_ns, column) for column in (*accel.T, yaw_rate)]
-    known = [column for column in columns if column is not None] + [Integral(driven[0], cumulative(*driven))]
+    columns = [motion.integral(start, imu.t_ns, column) for column in (*accel.T, yaw_rate)]
+    known = [column for column in columns if column is not None] + [
+        motion.Integral(driven[0], motion.cumulative(*driven))
+    ]
     first, last = max(one.t_s[0] for one in known), min(one.t_s[-1] for one in known)
     if len(known) < 4 or not last - first >= 2.0 * SMOOTH_S:
         return None
@@ -277,14 +270,14 @@ def heading(context: CheckContext) -> ForceHeading | None:
 
 def turning_axis(context: CheckContext) -> str | None:
     """The axis of the gyro, with its sign, that turns as the wheels (else the truth) do."""
-    known = yaw_angles(context)
+    known = motion.yaw_angles(context)
     other = known.get("wheels") or known.get("truth")
     if other is None:
         return None
     best, name = 0.0, None
     for k, axis in enumerate("xyz"):
-        turned = gyro_angle(context.recording, k)
-        both = agreement(turned, other) if turned is not None else None
+        turned = motion.gyro_angle(context.recording, k)
+        both = motion.agreement(turned, other) if turned is not None else None
         if both is not None and both.is_significant() and abs(both.r) > best:
             best, name = abs(both.r), f"{'+' if both.r > 0 else '-'}{axis}"
     return name
@@ -292,7 +285,7 @@ def turning_axis(context: CheckContext) -> str | None:
 
 def wheels_turn_backwards(context: CheckContext) -> bool:
     """Whether the wheels turn against gyro z; on a straight run, whether they mostly run backwards."""
-    driven, wheels = wheel_speed(context), context.recording.wheels
+    driven, wheels = motion.wheel_speed(context), context.recording.wheels
     axis = turning_axis(context) if wheels is not None and wheels.has_sides() else None
     return axis == "-z" or (axis is None and driven is not None and float(driven[1].mean()) < 0.0)
 

@@ -9,18 +9,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.delays import opposed
 from terrafusion.datasets.checks.finding import CheckContext, with_fields
 from terrafusion.datasets.checks.imu import nearest_axis
-from terrafusion.datasets.checks.motion import (
-    LEAST_WINDOWS,
-    WINDOW_S,
-    common_span,
-    speeds,
-    typical_sigma,
-    yaw_angles,
-    yaw_rates,
-)
 from terrafusion.datasets.checks.path import (
     MeasuredPath,
     PathFits,
@@ -174,23 +166,23 @@ def _yaw(contexts: Sequence[CheckContext]) -> YawFit | None:
     if not pairs:
         return None
     difference, rate = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
-    if len(difference) < LEAST_WINDOWS or not min(difference.std(), rate.std()) > 0.0:
+    if len(difference) < motion.LEAST_WINDOWS or not min(difference.std(), rate.std()) > 0.0:
         return None
     covariance = np.cov(difference, rate)
     r = float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
     metric = all(context.wheel_radius_m() is not None for context in contexts)
     track = float(covariance[0, 1] / covariance[1, 1]) if metric and abs(r) > LEAST_TRACK_R else None
-    return YawFit(r, track, len(difference) * WINDOW_S)
+    return YawFit(r, track, len(difference) * motion.WINDOW_S)
 
 
 def _yaw_pair(context: CheckContext) -> tuple[Array, Array] | None:
     """Half-second means of right minus left wheel speed and of gyro z, each (N,)."""
-    angles = yaw_angles(context)
+    angles = motion.yaw_angles(context)
     if "wheels" not in angles or "gyro" not in angles:
         return None
     wheels, gyro = angles["wheels"], angles["gyro"]
-    start, end = common_span(wheels, gyro)
-    grid = np.arange(start, end + 1e-9, WINDOW_S)
+    start, end = motion.common_span(wheels, gyro)
+    grid = np.arange(start, end + 1e-9, motion.WINDOW_S)
     return (wheels.rates(grid), gyro.rates(grid)) if len(grid) > 1 else None
 
 
@@ -232,7 +224,10 @@ def _whole(context: CheckContext, measured: MeasuredPath) -> PathFits | None:
 def _lags(context: CheckContext) -> Iterator[PairLag]:
     """Lags between the channels of `LAG_PAIRS` that are there."""
     radius = context.wheel_radius_m() or 1.0
-    known = {"yaw rate": yaw_rates(context.recording, radius), "speed": speeds(context.recording, radius)}
+    known = {
+        "yaw rate": motion.yaw_rates(context.recording, radius),
+        "speed": motion.speeds(context.recording, radius),
+    }
     for quantity, pairs in LAG_PAIRS.items():
         signals = known[quantity]
         for one, other in pairs:
@@ -277,7 +272,7 @@ def _path_lengths(context: CheckContext) -> Iterator[tuple[str, float]]:
         v = np.nan_to_num(np.abs(wheels.side_speeds_mps(radius).mean(axis=1)))
         yield "wheels", float(np.sum(0.5 * (v[1:] + v[:-1]) * np.diff(wheels.t_ns)) * 1e-9)
     if gnss is not None:
-        yield "gnss", _ruler_path_m(gnss.enu_m, max(0.5, 3.0 * (typical_sigma(gnss) or 1.0)))
+        yield "gnss", _ruler_path_m(gnss.enu_m, max(0.5, 3.0 * (motion.typical_sigma(gnss) or 1.0)))
     if truth is not None and np.isfinite(truth.position_m[:, 0]).any():
         yield "truth", _ruler_path_m(truth.position_m, 0.1)
 

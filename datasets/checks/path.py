@@ -10,16 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.checks.motion import (
-    cumulative,
-    gyro_angle,
-    on_plane,
-    seconds,
-    typical_sigma,
-    wheel_speed,
-)
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
@@ -83,12 +76,14 @@ def measured_paths(recording: Recording) -> list[MeasuredPath]:
     gnss, truth = recording.gnss, recording.truth
     if gnss is not None:
         known = np.asarray(np.isfinite(gnss.enu_m[:, :2]).all(axis=1) & (gnss.fix > 0))
-        t_s = seconds(gnss.t_ns[known], start)
-        found.append(MeasuredPath("gnss", t_s, on_plane(gnss.enu_m[known]), typical_sigma(gnss)))
+        t_s = motion.seconds(gnss.t_ns[known], start)
+        found.append(
+            MeasuredPath("gnss", t_s, motion.on_plane(gnss.enu_m[known]), motion.typical_sigma(gnss))
+        )
     if truth is not None and len(truth):
         known = np.asarray(np.isfinite(truth.position_m[:, :2]).all(axis=1))
-        t_s = seconds(truth.t_ns[known], start)
-        found.append(MeasuredPath("truth", t_s, on_plane(truth.position_m[known]), 0.0))
+        t_s = motion.seconds(truth.t_ns[known], start)
+        found.append(MeasuredPath("truth", t_s, motion.on_plane(truth.position_m[known]), 0.0))
     return [path for path in found if len(path.t_s) >= 2 * LEAST_FIXES]
 
 
@@ -108,7 +103,7 @@ def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, 
         Times (N,) s since the start, distance rolled (N,) m, and positions (N,) m, east + i north, of
         a robot that starts eastwards; None where wheels or their radius are unknown.
     """
-    driven, yaw = wheel_speed(context, metric=True), gyro_angle(context.recording)
+    driven, yaw = motion.wheel_speed(context, metric=True), motion.gyro_angle(context.recording)
     if driven is None:
         return None
     t, v = driven
@@ -120,7 +115,7 @@ def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, 
     if len(t) < 10:
         return None
     ahead = np.exp(1j * heading)
-    return t, cumulative(t, v, unsigned=True), cumulative(t, v * ahead) + point_m * ahead
+    return t, motion.cumulative(t, v, unsigned=True), motion.cumulative(t, v * ahead) + point_m * ahead
 
 
 def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFits | None:

@@ -5,17 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed
 from terrafusion.datasets.checks.imu import at_rest
-from terrafusion.datasets.checks.motion import (
-    Integral,
-    agreement,
-    common_span,
-    cumulative,
-    wheel_speed,
-    yaw_angles,
-)
 from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
@@ -78,11 +71,11 @@ def radius_difference(context: CheckContext) -> BootstrapInterval | None:
     Right minus left speed is regressed on yaw rate (the effective track), speed (the difference of the radii)
     and a constant (the gyro's bias, which a rest shows). None on soft ground, where the sides slip.
     """
-    known, wheels = yaw_angles(context), context.recording.wheels
+    known, wheels = motion.yaw_angles(context), context.recording.wheels
     if wheels is None or "gyro" not in known or "wheels" not in known or not is_firm(context.recording):
         return None
     gyro, apart, bias = known["gyro"], known["wheels"], _rest_bias(context)
-    both = agreement(gyro, apart)
+    both = motion.agreement(gyro, apart)
     rolled = _rolled(context)
     if (
         both is None
@@ -91,7 +84,7 @@ def radius_difference(context: CheckContext) -> BootstrapInterval | None:
         or (bias is not None and abs(bias) > MOST_BIAS_RADPS)
     ):
         return None
-    start, end = common_span(gyro, apart)
+    start, end = motion.common_span(gyro, apart)
     grid = np.arange(start, end, WINDOW_S)
     columns = np.stack([rolled.rates(grid), gyro.rates(grid), np.ones(len(grid) - 1)], axis=1)
     difference = apart.rates(grid)
@@ -122,10 +115,10 @@ def _rest_bias(context: CheckContext) -> float | None:
     return float(np.nanmean(values)) if np.isfinite(values).any() else None
 
 
-def _rolled(context: CheckContext) -> Integral | None:
+def _rolled(context: CheckContext) -> motion.Integral | None:
     """Distance rolled as the mean of both sides, in the unit of `yaw_angles`."""
-    driven = wheel_speed(context)
-    return None if driven is None else Integral(driven[0], cumulative(*driven))
+    driven = motion.wheel_speed(context)
+    return None if driven is None else motion.Integral(driven[0], motion.cumulative(*driven))
 
 
 def _scaled(wheels: Wheels, side: str, factor: float) -> Wheels:

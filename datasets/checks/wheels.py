@@ -6,20 +6,9 @@ from functools import partial
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed
 from terrafusion.datasets.checks.imu import gravity, heading, wheels_turn_backwards
-from terrafusion.datasets.checks.motion import (
-    ANY_RADIUS_M,
-    SURE_R,
-    Integral,
-    agreement,
-    common_span,
-    cumulative,
-    integral,
-    on_plane,
-    seconds,
-    wheel_speed,
-)
 from terrafusion.datasets.checks.path import measured_paths
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
@@ -136,7 +125,7 @@ def sides_opposed(context: CheckContext) -> str | None:
     wheels = context.recording.wheels
     if wheels is None or not wheels.has_sides():
         return None
-    sides = wheels.side_speeds_mps(context.wheel_radius_m() or ANY_RADIUS_M)
+    sides = wheels.side_speeds_mps(context.wheel_radius_m() or motion.ANY_RADIUS_M)
     known = np.isfinite(sides).all(axis=1)
     t_ns, sides = wheels.t_ns[known], sides[known]
     moving = (np.abs(sides) > 0.05 * np.abs(sides).max(initial=0.0)).all(axis=1) & sides.any(axis=1)
@@ -147,16 +136,16 @@ def sides_opposed(context: CheckContext) -> str | None:
     if np.abs(together[moving]).mean() > 0.5 * np.abs(sides[moving]).mean():
         return None
     imu, start = context.recording.imu, context.recording.start_ns
-    gyro = None if imu is None else integral(start, imu.t_ns, _vertical_rate(context, imu))
+    gyro = None if imu is None else motion.integral(start, imu.t_ns, _vertical_rate(context, imu))
     if gyro is not None:
         rate = float(np.abs(gyro.rates(np.linspace(gyro.t_s[0], gyro.t_s[-1], 200))).mean())
         if rate * WIDEST_TRACK_M > float(apart.mean()):
             return None
-        summed = integral(start, t_ns, together)
-        by_sum = agreement(gyro, summed) if summed is not None else None
+        summed = motion.integral(start, t_ns, together)
+        by_sum = motion.agreement(gyro, summed) if summed is not None else None
         if by_sum is not None and by_sum.is_significant():
             return f"the gyro follows their sum (correlation {abs(by_sum.r):.2f})"
-    covered = _progress(context, integral(start, t_ns, 0.5 * apart))
+    covered = _progress(context, motion.integral(start, t_ns, 0.5 * apart))
     if covered is None:
         return ""
     progress, source = covered
@@ -173,7 +162,7 @@ def _vertical_rate(context: CheckContext, imu: Imu) -> Array:
     return np.asarray(imu.gyro_radps @ (mean / np.linalg.norm(mean)))
 
 
-def _progress(context: CheckContext, rolled: Integral | None) -> tuple[float, str] | None:
+def _progress(context: CheckContext, rolled: motion.Integral | None) -> tuple[float, str] | None:
     """Distance covered over distance rolled, both in steps of 10 s, and the source of positions."""
     for path in measured_paths(context.recording):
         grid = np.arange(path.t_s[0], path.t_s[-1], 10.0)
@@ -188,7 +177,7 @@ def _progress(context: CheckContext, rolled: Integral | None) -> tuple[float, st
 
 def runs_backwards(context: CheckContext) -> str | None:
     """Evidence that the wheels report backwards when the robot drives forward; None where there is none."""
-    driven = wheel_speed(context)
+    driven = motion.wheel_speed(context)
     if driven is None:
         return None
     found = heading(context)
@@ -196,9 +185,9 @@ def runs_backwards(context: CheckContext) -> str | None:
         backwards = abs(found.angle) > 0.75 * np.pi and wheels_turn_backwards(context)
         return "acceleration answers them with the opposite sign" if backwards else None
     t, v = driven
-    rolled = Integral(t, cumulative(t, v))
+    rolled = motion.Integral(t, motion.cumulative(t, v))
     for name, forward in _forward_distances(context).items():
-        start, end = common_span(rolled, forward)
+        start, end = motion.common_span(rolled, forward)
         if end - start < LEAST_S:
             continue
         grid = np.arange(start, end, 0.5)
@@ -206,23 +195,23 @@ def runs_backwards(context: CheckContext) -> str | None:
         power = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
         if power > 0.0 and np.abs(a).mean() > LEAST_MPS:
             r = float(np.sum(a * b)) / power
-            return f"{name} goes the other way (correlation {r:.2f})" if r < -SURE_R else None
+            return f"{name} goes the other way (correlation {r:.2f})" if r < -motion.SURE_R else None
     total = float(np.abs(v).sum())
     mostly = total > 0.0 and float(v.sum()) / total < -0.8 and t[-1] - t[0] > LEAST_S
     return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(context) else None
 
 
-def _forward_distances(context: CheckContext) -> dict[str, Integral]:
+def _forward_distances(context: CheckContext) -> dict[str, motion.Integral]:
     """Signed distance driven forward (m) by truth and command."""
     recording, start = context.recording, context.recording.start_ns
     truth, command = recording.truth, recording.command
-    found: dict[str, Integral | None] = {}
+    found: dict[str, motion.Integral | None] = {}
     if truth is not None and truth.quaternion is not None:
         known = np.isfinite(truth.position_m[:, :2]).all(axis=1) & np.isfinite(truth.quaternion).all(axis=1)
         if known.sum() > 10:
-            t, yaw = seconds(truth.t_ns[known], start), truth.yaw_rad()[known]
-            forward = np.real(np.diff(on_plane(truth.position_m[known])) * np.exp(-1j * yaw[:-1]))
-            found["the truth"] = Integral(t, np.concatenate([[0.0], np.cumsum(forward)]))
+            t, yaw = motion.seconds(truth.t_ns[known], start), truth.yaw_rad()[known]
+            forward = np.real(np.diff(motion.on_plane(truth.position_m[known])) * np.exp(-1j * yaw[:-1]))
+            found["the truth"] = motion.Integral(t, np.concatenate([[0.0], np.cumsum(forward)]))
     if command is not None:
-        found["the command"] = integral(start, command.t_ns, command.v_mps)
+        found["the command"] = motion.integral(start, command.t_ns, command.v_mps)
     return {name: distance for name, distance in found.items() if distance is not None}

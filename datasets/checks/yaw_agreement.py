@@ -10,24 +10,15 @@ from itertools import combinations, product
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, once, scaled
 from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.imu import heading, is_upright
-from terrafusion.datasets.checks.motion import (
-    TRUTH_WINDOW_S,
-    WINDOW_S,
-    Agreement,
-    Integral,
-    agreement,
-    common_span,
-    course_agreement,
-    yaw_angles,
-)
 from terrafusion.datasets.checks.wheels import runs_backwards, sides_opposed
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions, apply
 
-Agreements = dict[tuple[str, str], Agreement]
+Agreements = dict[tuple[str, str], motion.Agreement]
 Signs = dict[tuple[str, str], float]
 """By pair of yaw sources 1 where they turn alike, -1 where they turn against each other."""
 
@@ -140,18 +131,18 @@ def _agreements(context: CheckContext) -> Agreements:
 @once
 def agreements(context: CheckContext) -> Agreements:
     """Agreement of every pair of yaw sources that can be compared, in the order of `SUSPECTS`."""
-    known = yaw_angles(context)
-    found: dict[tuple[str, str], Agreement | None] = {}
+    known = motion.yaw_angles(context)
+    found: dict[tuple[str, str], motion.Agreement | None] = {}
     for one, other in combinations(SUSPECTS, 2):
         if one in known and other in known:
-            window_s = TRUTH_WINDOW_S if "truth" in (one, other) else WINDOW_S
-            found[one, other] = agreement(known[one], known[other], window_s)
+            window_s = motion.TRUTH_WINDOW_S if "truth" in (one, other) else motion.WINDOW_S
+            found[one, other] = motion.agreement(known[one], known[other], window_s)
     gnss, track_m = context.recording.gnss, context.rig.track_m if context.rig else 1.0
     if gnss is not None:
         for name, unit in (("gyro", 1.0), ("wheels", track_m)):
             if name in known:
-                yaw = Integral(known[name].t_s, known[name].value / unit)
-                found[name, "gnss"] = course_agreement(yaw, gnss, context.recording.start_ns)
+                yaw = motion.Integral(known[name].t_s, known[name].value / unit)
+                found[name, "gnss"] = motion.course_agreement(yaw, gnss, context.recording.start_ns)
     return {pair: both for pair, both in found.items() if both is not None}
 
 
@@ -173,7 +164,7 @@ def contradictors(signs: Signs) -> list[frozenset[str]]:
 
 
 def _signs(context: CheckContext, found: Agreements) -> Signs:
-    known = yaw_angles(context)
+    known = motion.yaw_angles(context)
     signs = {}
     for (a, b), both in found.items():
         delayed = both.r < 0.0 and a in known and b in known and is_delayed(known[a], known[b], both.r)
@@ -185,12 +176,12 @@ def _signs(context: CheckContext, found: Agreements) -> Signs:
     return signs
 
 
-def is_delayed(a: Integral, b: Integral, r: float) -> bool:
+def is_delayed(a: motion.Integral, b: motion.Integral, r: float) -> bool:
     """Whether two rates of negative correlation `r` agree clearly better unchanged but shifted in time."""
-    grid = np.arange(*common_span(a, b), FINE_S)
+    grid = np.arange(*motion.common_span(a, b), FINE_S)
     if len(grid) < 3:
         return False
-    kernel = np.ones(round(WINDOW_S / FINE_S)) * FINE_S / WINDOW_S
+    kernel = np.ones(round(motion.WINDOW_S / FINE_S)) * FINE_S / motion.WINDOW_S
     one, other = (np.convolve(x.rates(grid), kernel, "valid") for x in (a, b))
     reach = min(round(REACH_S / FINE_S), len(one) // 4)
     if reach < 1 or min(one.std(), other.std()) <= 0.0:
