@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
 from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed, retiming
@@ -24,7 +23,7 @@ from terrafusion.datasets.checks.sensor_pairs import (
 )
 from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 
@@ -206,7 +205,7 @@ def _common_grid(one: Signal, other: Signal) -> tuple[Array, np.int64]:
     return np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S), start
 
 
-def _resampled(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, NDArray[np.bool_]]:
+def _resampled(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, Mask]:
     """A signal at other times, and whether it is known there: away from its gaps."""
     known = np.isfinite(signal[1])
     t_s, values = (signal[0][known] - origin_ns) * 1e-9, signal[1][known]

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -115,7 +114,7 @@ def scaled(channel: str, factor: float, *fields: str) -> Repair:
     )
 
 
-def without_rows(channel: str, rows: NDArray[np.bool_]) -> Repair:
+def without_rows(channel: str, rows: Mask) -> Repair:
     """A repair that drops the rows of a mask."""
     return changed(channel, lambda old: old.select(~rows))
 

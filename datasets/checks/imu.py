@@ -10,7 +10,6 @@ from functools import partial
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
@@ -26,7 +25,7 @@ from terrafusion.datasets.checks.finding import (
 )
 from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
-from terrafusion.datasets.core.arrays import Array, Complex
+from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
@@ -161,7 +160,7 @@ def _bias_of_tilt(imu: Imu) -> Array:
     return bias
 
 
-def at_rest(context: CheckContext) -> NDArray[np.bool_]:
+def at_rest(context: CheckContext) -> Mask:
     """Mask (N,) of the IMU's samples during standstills of all wheels."""
     wheels, imu = context.recording.wheels, context.recording.imu
     if wheels is None or imu is None or len(wheels) < 2:

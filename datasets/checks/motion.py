@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, once
-from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
+from terrafusion.datasets.core.arrays import Array, Complex, Mask, TimesNs
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
 
@@ -70,7 +70,7 @@ def cumulative(t_s: Array, rate: NDArray[Any], *, unsigned: bool = False) -> NDA
     return np.concatenate([[0.0], np.cumsum(np.abs(steps) if unsigned else steps)])
 
 
-def runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def runs(mask: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First row of each run of True, and the row after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return edges[::2], edges[1::2]

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
 from terrafusion.datasets.checks.finding import CheckContext
@@ -171,7 +170,7 @@ def _rest(windows: _Windows, delay_s: float) -> float:
     return total
 
 
-def _normal(windows: _Windows, unknown: Array) -> tuple[NDArray[np.float64], Array, float]:
+def _normal(windows: _Windows, unknown: Array) -> tuple[Array, Array, float]:
     """Normal equations (W, 5, 5) and (W, 5) of the windows with Huber weights, and the residuals' 1 sigma."""
     steps = list(windows.steps(unknown))
     if not steps:

@@ -5,7 +5,6 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import (
     CheckContext,
@@ -18,7 +17,7 @@ from terrafusion.datasets.checks.finding import (
     retimed,
     retiming,
 )
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.recording import Recording
 
@@ -142,7 +141,7 @@ def coarse_tick_s(channel: Channel) -> float:
     return round(tick, 6)
 
 
-def _same_rows(channel: Channel) -> NDArray[np.bool_]:
+def _same_rows(channel: Channel) -> Mask:
     """Whether each row but the first equals the one before."""
     columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
     return np.all([(v[1:] == v[:-1]) | (np.isnan(v[1:]) & np.isnan(v[:-1])) for v in columns], axis=0)

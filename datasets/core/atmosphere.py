@@ -8,12 +8,10 @@ each 10 K; the weather shifts all heights by 0.083 m/Pa at sea level.
 
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 
-F = TypeVar("F", float, NDArray[np.float64])
+F = TypeVar("F", float, Array)
 
 PRESSURE_PA = 101_325.0
 TEMPERATURE_K = 288.15

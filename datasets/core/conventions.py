@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
 from terrafusion.datasets.core.quantity import Position, Sourced, Word
 from terrafusion.datasets.core.recording import Recording
@@ -139,7 +138,7 @@ def _true_updates(recording: Recording, c: Conventions) -> Recording:
     return recording
 
 
-def true_updates(values: Array, rows: int) -> NDArray[np.bool_]:
+def true_updates(values: Array, rows: int) -> Mask:
     """Mask (N,) of the rows of `values` (N, k) that are updates: changes, and every `rows` rows of a run."""
     same = np.zeros(len(values), dtype=bool)
     same[1:] = ((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))).all(axis=1)

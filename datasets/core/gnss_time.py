@@ -1,7 +1,8 @@
 """GPS time and UTC: the leap seconds between them."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from terrafusion.datasets.core.arrays import TimesNs
 
 GPS_EPOCH_S = 315_964_800
 """Unix time of the GPS epoch, 1980-01-06 00:00:00 UTC."""
@@ -25,7 +26,7 @@ _FROM_UNIX_NS = np.array([date for date, _ in LEAP_SECONDS], dtype="datetime64[n
 _OFFSET_S = np.array([0, *(offset for _, offset in LEAP_SECONDS)], dtype=np.int64)
 
 
-def gps_to_unix_ns(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def gps_to_unix_ns(gps_ns: TimesNs) -> TimesNs:
     """Unix nanoseconds (N,) of GPS time, given as nanoseconds since the GPS epoch.
 
     Unix time repeats a second during a leap second.
@@ -35,7 +36,7 @@ def gps_to_unix_ns(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return without - _OFFSET_S[np.searchsorted(starts, without, side="right")] * 10**9
 
 
-def leap_note(unix_ns: NDArray[np.int64]) -> str:
+def leap_note(unix_ns: TimesNs) -> str:
     """A note on the leap seconds that were subtracted."""
     taken = np.unique(_OFFSET_S[np.searchsorted(_FROM_UNIX_NS, unix_ns[[0, -1]], side="right")])
     seconds = " and ".join(str(int(s)) for s in taken)

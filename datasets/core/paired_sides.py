@@ -1,8 +1,8 @@
 """Wheels whose sides are sampled at different times, brought to common times."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Wheels
 
 LEAST_SAMPLES, MOST_WHOLE = 10, 0.1
@@ -38,9 +38,7 @@ def paired_sides(wheels: Wheels) -> Wheels:
     )
 
 
-def _at(
-    t_s: NDArray[np.float64], values: NDArray[np.float64], wanted_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _at(t_s: Array, values: Array, wanted_s: Array) -> tuple[Array, Mask]:
     """Columns interpolated each over its own samples, and where all of them are near one."""
     out, near = np.full((len(wanted_s), values.shape[1]), np.nan), np.ones(len(wanted_s), dtype=bool)
     for k, column in enumerate(values.T):

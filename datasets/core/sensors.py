@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.quantity import Position, Sourced
 from terrafusion.datasets.core.robot import DRIVES as DRIVES
@@ -31,7 +31,7 @@ ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
 
 
-def axes_matrix(axes: tuple[str, ...]) -> NDArray[np.float64]:
+def axes_matrix(axes: tuple[str, ...]) -> Array:
     """Rotation matrix (3, 3) of sensor axes that lie along body x, y, z: v_body = matrix @ v_sensor.
 
     Raises:
@@ -73,7 +73,7 @@ class ImuSpec:
     def __post_init__(self) -> None:
         axes_matrix(self.axes)
 
-    def base_from_sensor(self) -> NDArray[np.float64]:
+    def base_from_sensor(self) -> Array:
         """Rotation matrix (3, 3): vector in the body frame = matrix @ vector in the sensor frame."""
         return axes_matrix(self.axes)
 

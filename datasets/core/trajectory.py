@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 
@@ -30,7 +29,7 @@ class Trajectory:
         covariance: (N, 6, 6) of the pose, ROS order (translation then rotation, world axes), or None.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: TimesNs
     position_m: Array
     quaternion: Array | None = None
     twist_body: Array | None = None
@@ -104,7 +103,7 @@ class Trajectory:
         step = np.diff(self.position_m[:, :2], axis=0)
         return float(np.nansum(np.hypot(step[:, 0], step[:, 1])))
 
-    def positions_at(self, t_ns: NDArray[np.int64]) -> Array:
+    def positions_at(self, t_ns: TimesNs) -> Array:
         """Positions (M, 3) at the times (M,), linearly interpolated; NaN outside the trajectory's span."""
         out = np.full((len(t_ns), 3), np.nan)
         if not len(self):
@@ -115,7 +114,7 @@ class Trajectory:
             out[:, axis] = np.interp(query, grid, self.position_m[:, axis], left=np.nan, right=np.nan)
         return out
 
-    def quaternions_at(self, t_ns: NDArray[np.int64]) -> Array:
+    def quaternions_at(self, t_ns: TimesNs) -> Array:
         """Orientations (M, 4) at the times (M,), by slerp; NaN outside the span or when unknown."""
         out = np.full((len(t_ns), 4), np.nan)
         if self.quaternion is None or len(self) < 2:
@@ -128,7 +127,7 @@ class Trajectory:
         out[inside] = slerp((t_ns[inside] - origin) * 1e-9).as_quat()
         return out
 
-    def points_at(self, t_ns: NDArray[np.int64], lever_m: tuple[float, ...] | Array) -> Array:
+    def points_at(self, t_ns: TimesNs, lever_m: tuple[float, ...] | Array) -> Array:
         """World positions (M, 3) of the body-fixed point `lever_m` at the times (M,)."""
         lever = np.asarray(lever_m, dtype=float)
         positions = self.positions_at(t_ns)

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import distinct
+from terrafusion.datasets.core.arrays import Array, Mask, distinct
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -218,7 +218,7 @@ class ChannelReader:
         except DataError as error:
             raise self._error("truth", error.what, error.remedy or "", time_s=error.time_s) from None
 
-    def _quaternion(self, table: CsvTable) -> NDArray[np.float64] | None:
+    def _quaternion(self, table: CsvTable) -> Array | None:
         present = [name for name in QUATERNION if name in table.numbers]
         if not present:
             return None
@@ -233,7 +233,7 @@ class ChannelReader:
             raise self._row_error("truth", table, int(off[0]), what, "give unit quaternions x, y, z, w")
         return q
 
-    def _covariance(self, table: CsvTable) -> NDArray[np.float64] | None:
+    def _covariance(self, table: CsvTable) -> Array | None:
         """(N, 6, 6); what is missing below the diagonal is taken from above it."""
         present = [name for name in COVARIANCE if name in table.numbers]
         if not present:
@@ -290,7 +290,7 @@ class ChannelReader:
         return self._error(channel, f"{what} at data row {row + 1}", remedy, time_s=time_s)
 
 
-def rows_with_values(numbers: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.bool_]:
+def rows_with_values(numbers: Mapping[str, Array], n: int) -> Mask:
     """Mask (n,) of the rows in which at least one of the columns (n,) is not NaN."""
     held = np.zeros(n, dtype=bool)
     for column in numbers.values():

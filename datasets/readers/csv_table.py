@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
@@ -31,7 +31,7 @@ class CsvTable:
         notes: what was odd about the file, in sentences.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: TimesNs
     numbers: dict[str, Array]
     texts: dict[str, NDArray[Any]]
     notes: tuple[str, ...] = ()
@@ -113,12 +113,12 @@ def _header(data: bytes, known: list[str], texts: Sequence[str], prefixes: Seque
     return header
 
 
-def read_times(path: Path) -> NDArray[np.int64]:
+def read_times(path: Path) -> TimesNs:
     """The times of a table as they stand there, in any order; errors as in `read_table`."""
     return read_table(path, (), texts=("fix", "label"), prefixes=("",), in_order=False).t_ns
 
 
-def _check_times(t_ns: NDArray[np.int64], *, in_order: bool) -> None:
+def _check_times(t_ns: TimesNs, *, in_order: bool) -> None:
     far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
     if far.size:
         raise DataError(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.decimals import NotADecimal, to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
@@ -87,7 +87,7 @@ class TextTable:
         missing = np.full(len(self), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def times_ns(self, name: str, unit: str = "s", remedy: str = "") -> NDArray[np.int64]:
+    def times_ns(self, name: str, unit: str = "s", remedy: str = "") -> TimesNs:
         """A text column of decimal times as nanoseconds (N,).
 
         Raises:

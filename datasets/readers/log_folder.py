@@ -98,12 +98,12 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
     if contents is None:
         contents = () if truth is None else truth_contents(truth)
     same = ("start_ns", "vehicle", "datum", "truth_frame", "metadata")
-    texts = ("description", "licence", "source", "imu_frame_id")
+    stated: dict[str, Any] = {key: getattr(meta, key) for key in same}
+    stated |= {key: getattr(meta, key) or "" for key in ("description", "licence", "source", "imu_frame_id")}
     return Recording(
         name=name if meta.name is None else meta.name,
         **channels,
-        **{key: getattr(meta, key) for key in same},
-        **{key: getattr(meta, key) or "" for key in texts},
+        **stated,
         terrain_name=meta.terrain or "",
         truth_channels=contents,
         overrides=meta.overrides(),

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.cdr import CdrTemplate, split
@@ -43,9 +43,9 @@ class WrittenEstimate:
     """
 
     trajectory: Trajectory
-    twist_covariance: NDArray[np.float64] | None = None
+    twist_covariance: Array | None = None
     frame: str = "map"
-    diagnostics_ns: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    diagnostics_ns: TimesNs = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     diagnostics: Sequence[Sequence[Status]] = ()
 
     def topics(self, shift_ns: int) -> Iterator[TopicMessages]:
@@ -60,7 +60,7 @@ class WrittenEstimate:
             yield _diagnostics(self.diagnostics_ns + shift_ns, self.diagnostics)
 
 
-def _diagnostics(t_ns: NDArray[np.int64], statuses: Sequence[Sequence[Status]]) -> TopicMessages:
+def _diagnostics(t_ns: TimesNs, statuses: Sequence[Sequence[Status]]) -> TopicMessages:
     """diagnostic_msgs/DiagnosticArray; texts differ in length, so each message has its own layout."""
 
     def encode(rows: slice) -> list[bytes]:

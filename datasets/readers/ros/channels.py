@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -91,7 +90,7 @@ class ChannelBuilder:
             return None
         return Magnetometer(t_ns[held], self._to_body("magnetometer", stream, field)[0][held])
 
-    def _held(self, name: str, topic: str, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _held(self, name: str, topic: str, held: Mask) -> Mask:
         if not held.all():
             lost = int((~held).sum())
             self.notes.append(f"{name}: {lost} of {len(held)} messages of {topic} hold no number; left out")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Steering, Wheels
 from terrafusion.datasets.readers.ros.messages import Stream
 
@@ -90,7 +90,7 @@ def joint_names(stream: Stream) -> list[str]:
     return list(dict.fromkeys(name for _, names in firsts for name in names))
 
 
-def holding(stream: Stream, joints: Sequence[str]) -> NDArray[np.bool_]:
+def holding(stream: Stream, joints: Sequence[str]) -> Mask:
     """Mask (N,) of the messages that name all these joints."""
     held = np.zeros(len(stream), dtype=bool)
     for rows, names, _ in _by_names(stream):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import TimesNs
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
@@ -173,7 +173,7 @@ def _same_rate(a_ns: TimesNs, b_ns: TimesNs) -> bool:
     return bool(abs(a - b) <= SAME_RATE * b)
 
 
-def _offset_at(headed: Times, receipt: Times, t_ns: TimesNs) -> NDArray[np.float64]:
+def _offset_at(headed: Times, receipt: Times, t_ns: TimesNs) -> Array:
     """How many ns the header clock was behind the recorder's at these receipt times."""
     best = _most_frequent(headed)
     order = np.argsort(receipt[best], kind="stable")

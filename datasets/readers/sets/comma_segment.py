@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Steering, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_from_ecef, matrix_to_quaternion, quaternion_to_matrix
@@ -182,7 +181,7 @@ def _unix_less_boot(gnss: Signal | None, frames: dict[str, Array]) -> tuple[np.i
     return np.int64(0), ["times: no UTC in the segment; they count from the start of the device"]
 
 
-def _is_utc_ms(utc: Array) -> NDArray[np.bool_]:
+def _is_utc_ms(utc: Array) -> Mask:
     return np.asarray((utc > 1e11) & (utc < 4e12))
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, sha256_of
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Command, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError, errors_of
@@ -132,7 +132,7 @@ def _since_first(known: Any, channel: str, what: str, notes: list[str]) -> slice
     return slice(first, None)
 
 
-def _motor(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> tuple[Motor | None, slice]:
+def _motor(t_ns: TimesNs, table: Table, notes: list[str]) -> tuple[Motor | None, slice]:
     """The motors, and the rows from which on they, and the wheels' encoders with them, are on."""
     if not {f"{side}_wheel_{what}" for side in ("left", "right") for what in ("voltage", "current")} <= set(
         table
@@ -149,7 +149,7 @@ def _motor(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> tuple[Mot
     return Motor(t_ns[live], current[live], voltage[live]), live
 
 
-def _command_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> Command | None:
+def _command_of_drive(t_ns: TimesNs, table: Table, notes: list[str]) -> Command | None:
     state = table.get("calib_state")
     driving = np.ones(len(t_ns), dtype=bool) if state is None else state == COMMANDING
     if not driving.any():
@@ -163,7 +163,7 @@ def _command_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -
     return Command(t_ns[driving], twist[:, 0], twist[:, 1])
 
 
-def _truth_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> Trajectory:
+def _truth_of_drive(t_ns: TimesNs, table: Table, notes: list[str]) -> Trajectory:
     position = _stack(table, "icp_pos_x", "icp_pos_y", "icp_pos_z")
     quaternion = _stack(table, "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
     placed = position.any(axis=1) | quaternion[:, :3].any(axis=1)
@@ -195,7 +195,7 @@ def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recordi
     ]
 
 
-def _window(signals: dict[str, Array], begins: NDArray[np.bool_], conventions: Conventions) -> Recording:
+def _window(signals: dict[str, Array], begins: Mask, conventions: Conventions) -> Recording:
     """The last window of those whose command `begins` (k,) there."""
     part = _part_of_step(begins)
     t_ns = (part * WINDOW_SAMPLES + np.arange(WINDOW_SAMPLES, dtype=np.int64)) * SAMPLE_NS
@@ -221,13 +221,13 @@ def _signals(table: Table, *names: str) -> Array:
     return np.stack(columns, axis=-1)
 
 
-def _part_of_step(begins: NDArray[np.bool_]) -> int:
+def _part_of_step(begins: Mask) -> int:
     """Windows since the command changed; a log that begins inside a step counts from its start."""
     before = np.flatnonzero(begins)
     return min(len(begins) - 1 - int(before[-1]) if before.size else len(begins) - 1, WINDOWS_A_STEP - 1)
 
 
-def _command_of_window(t_ns: NDArray[np.int64], sides: Array, conventions: Conventions) -> Command | None:
+def _command_of_window(t_ns: TimesNs, sides: Array, conventions: Conventions) -> Command | None:
     """The commanded wheel rates (40, 2) as a twist, by the geometry that the robot's own driver uses."""
     radius, track = conventions.wheel_radius_m, conventions.track_m
     if radius is None or track is None:

@@ -7,9 +7,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
@@ -152,7 +151,7 @@ def _positions(file: MatlabFile) -> tuple[Array, tuple[float, float, float] | No
     return enu_m, (lat, lon, height), notes
 
 
-def seconds_to_ns(seconds: Array) -> NDArray[np.int64]:
+def seconds_to_ns(seconds: Array) -> TimesNs:
     """Unix seconds (N,) as int64 nanoseconds, to the resolution of the double."""
     whole = np.floor(seconds)
     return whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)

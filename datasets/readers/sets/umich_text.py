@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import wrap_angle, yaw_of
@@ -228,7 +228,7 @@ def _trajectory(rows: NumberRows) -> tuple[Trajectory, list[str]]:
     return Trajectory(rows.t_ns, rows.values[:, :3], rows.values[:, 3:]), notes
 
 
-def _gaps(t_ns: NDArray[np.int64]) -> list[str]:
+def _gaps(t_ns: TimesNs) -> list[str]:
     interval_s = np.diff(t_ns) * 1e-9
     period_s = float(np.median(interval_s))
     gaps = interval_s[interval_s > LOST_FRAME * period_s]

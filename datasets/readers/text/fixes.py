@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
@@ -32,7 +32,7 @@ class Fixes:
         sigma_v_mps: (N,), or None.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: TimesNs
     llh: Array
     fix: NDArray[np.uint8]
     sigma_enu_m: Array
@@ -70,7 +70,7 @@ def gnss_channel(
 
 def located(
     fixes: Fixes, datum: Datum | None, *, channel: str = "gnss", rows: str = "rows"
-) -> tuple[NDArray[np.bool_], Array, Datum | None, list[str]]:
+) -> tuple[Mask, Array, Datum | None, list[str]]:
     """Which of the fixes (N,) hold a position, their ENU positions (M, 3), the datum, and notes.
 
     Latitude and longitude 0, 0 is no position in a log that is elsewhere.

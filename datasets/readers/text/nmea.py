@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -98,7 +98,7 @@ def _receipt_days(epochs: NmeaEpochs) -> float:
     return float(np.rint((first.receipt_s - first.of_day_ns * 1e-9) / 86400.0) - first.day)
 
 
-def _fixes(request: Request, epochs: NmeaEpochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
+def _fixes(request: Request, epochs: NmeaEpochs, t_ns: TimesNs) -> tuple[Fixes, list[str]]:
     """The fixes, with HDOP for the sigmas that no GST gives."""
     notes = []
     fix, hdop = epochs.column("fix").astype(np.uint8), epochs.column("hdop")

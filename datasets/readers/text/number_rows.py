@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
@@ -38,7 +38,7 @@ class NumberRows:
     """
 
     path: Path
-    t_ns: NDArray[np.int64]
+    t_ns: TimesNs
     values: Array
     lines: NDArray[np.int64]
     notes: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class NumberRows:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "NumberRows":
+    def select(self, rows: Mask | NDArray[np.intp]) -> "NumberRows":
         """The rows of a mask or of indices."""
         return NumberRows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
 

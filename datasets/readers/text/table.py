@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, distinct
+from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -58,7 +58,7 @@ class TableColumns(Protocol):
     def read(self, names: list[str]) -> None: ...
     def numbers(self, name: str) -> Array: ...
     def texts(self, name: str) -> NDArray[Any]: ...
-    def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None: ...
+    def times_ns(self, name: str, unit: str) -> TimesNs | None: ...
 
 
 def claims(path: Path, head: bytes) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.delimited import TextTable
 
@@ -27,7 +27,7 @@ class DeviceClock:
     """Times (M,) of the rows (N,) bool that have one, and notes."""
 
     t_ns: TimesNs
-    rows: NDArray[np.bool_]
+    rows: Mask
     notes: tuple[str, ...]
 
 
@@ -67,11 +67,11 @@ def _known(values: Array | None) -> bool:
     return values is not None and bool(np.isfinite(values).any())
 
 
-def _left_out(rows: NDArray[np.bool_]) -> tuple[str, ...]:
+def _left_out(rows: Mask) -> tuple[str, ...]:
     return () if rows.all() else (f"{int((~rows).sum())} of {len(rows)} rows have no time; left out",)
 
 
-def _utc(columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
+def _utc(columns: TextTable) -> tuple[TimesNs, Mask]:
     """UTC as Unix nanoseconds (N,), and the rows (N,) that hold it."""
     parts = columns.stack(UTC)
     valid = np.asarray(np.isfinite(parts[:, :6]).all(axis=1))
@@ -133,7 +133,7 @@ def _update_rate(settings: dict[str, str]) -> float:
     return rate_hz
 
 
-def _dated(t_ns: TimesNs, utc: TimesNs, valid: NDArray[np.bool_]) -> tuple[TimesNs, str]:
+def _dated(t_ns: TimesNs, utc: TimesNs, valid: Mask) -> tuple[TimesNs, str]:
     """Device times shifted to UTC where any row has it."""
     if not valid.any():
         return t_ns, "times are of the device's clock: the export holds no valid UTC"

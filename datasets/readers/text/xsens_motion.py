@@ -1,9 +1,8 @@
 """Angular rate and specific force of an MT Manager export, and the unit the rates are in."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
@@ -22,9 +21,7 @@ TURNING_RADPS = 0.05
 DEG = np.pi / 180.0
 
 
-def inertial(
-    columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
-) -> tuple[Imu | None, list[str]]:
+def inertial(columns: TextTable, t_ns: TimesNs, settings: dict[str, str]) -> tuple[Imu | None, list[str]]:
     """The IMU channel of the rows that hold a sample (None where none does), and notes.
 
     Raises:
@@ -52,7 +49,7 @@ def inertial(
 
 
 def _in_radps(
-    gyro: Array, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
+    gyro: Array, columns: TextTable, t_ns: TimesNs, settings: dict[str, str]
 ) -> tuple[Array, list[str]]:
     """Rates in rad/s: by the column's name, else by the attitude, else as documented."""
     units = {settings.get(f"unit of {name}", "") for name in GYR}
@@ -81,7 +78,7 @@ def _in_radps(
     return gyro, []
 
 
-def _rate_ratio(gyro: Array, columns: TextTable, t_ns: NDArray[np.int64]) -> float | None:
+def _rate_ratio(gyro: Array, columns: TextTable, t_ns: TimesNs) -> float | None:
     """Ratio of the gyro's rate to that of the attitude; None where too little turns."""
     if all(name in columns.numbers for name in ATTITUDES[0]):
         q = columns.stack(ATTITUDES[0])[:CHECKED_ROWS, [1, 2, 3, 0]]

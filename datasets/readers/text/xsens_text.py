@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, distinct
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -144,7 +144,7 @@ def _unnamed(data: bytes, header: int, separator: str, count: int) -> list[str]:
     return [""] if row.endswith(separator) and row.count(separator) == count else []
 
 
-def _select(columns: TextTable, rows: NDArray[np.bool_], order: Any) -> TextTable:
+def _select(columns: TextTable, rows: Mask, order: Any) -> TextTable:
     return dataclasses.replace(
         columns,
         numbers={name: values[rows][order] for name, values in columns.numbers.items()},
@@ -159,7 +159,7 @@ def _device(settings: dict[str, str]) -> str:
 
 
 def _gnss(
-    request: Request, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
+    request: Request, columns: TextTable, t_ns: TimesNs, settings: dict[str, str]
 ) -> tuple[Gnss | None, tuple[float, float, float] | None, list[str]]:
     if not {"Latitude", "Longitude"} <= columns.numbers.keys():
         return None, None, []
@@ -181,7 +181,7 @@ def _gnss(
     return gnss, datum, [*notes, *fix_notes, *more, *rest]
 
 
-def _fix(columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
+def _fix(columns: TextTable, rows: Mask) -> tuple[NDArray[np.uint8], list[str]]:
     name = next((name for name in STATUS if name in columns.texts), None)
     if name is None:
         return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [

@@ -12,6 +12,7 @@ from terrafusion.datasets.checks import delays
 from terrafusion.datasets.checks.bootstrap_interval import BootstrapInterval
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import Signal
+from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.checks.sensor_pairs import Pair
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
@@ -123,6 +124,7 @@ def test_late_fixes(
         assert drive.gnss is not None
         np.testing.assert_array_equal(moved.t_ns, drive.gnss.t_ns - round(value * 1e9))
     monkeypatch.setattr(delays, "path_by", lambda *_: None)
+    monkeypatch.setattr(delays, "path_model", path_model)
     assert not list(delays._late_fixes(CheckContext(drive, None)))
 
 
