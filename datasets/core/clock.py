@@ -80,6 +80,15 @@ def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:
     return np.argsort(t_ns, kind="stable") if (t_ns[1:] < t_ns[:-1]).any() else None
 
 
+def sorting(t_ns: TimesNs, name: str, rows: str = "rows") -> tuple[NDArray[np.intp], str] | None:
+    """`in_order`, with a note on how many of the rows of channel `name` change places."""
+    order = in_order(t_ns)
+    if order is None:
+        return None
+    moved = int((order != np.arange(len(order))).sum())
+    return order, f"{name}: {moved} {rows} out of order were sorted"
+
+
 def _shifted(t_ns: TimesNs, steps: list[Step], channel: str) -> TimesNs:
     if not steps:
         return t_ns

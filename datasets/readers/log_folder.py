@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import TimesNs
-from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.clock import repair_together, sorting
 from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -130,12 +130,11 @@ class _Folder:
             return read_table(path, known, texts=texts, prefixes=prefixes)
         table = read_table(path, known, texts=texts, prefixes=prefixes, in_order=False)
         table = dataclasses.replace(table, t_ns=self.clocks[channel])
-        order = in_order(table.t_ns)
-        if order is None:
+        late = sorting(table.t_ns, channel)
+        if late is None:
             return table
-        moved = int((order != np.arange(len(order))).sum())
-        self.notes.append(f"{channel}: {moved} rows out of order were sorted")
-        return table.select(order)
+        self.notes.append(late[1])
+        return table.select(late[0])
 
     def place(self, channel: str) -> Path:
         return self._path(channel) or self.folder

@@ -1,13 +1,12 @@
 """Times of a bag's messages: header stamps or receipt stamps, and the repair of clock steps."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
-from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.clock import in_order, repair_together, sorting
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.ros.messages import Stream
@@ -223,15 +222,8 @@ def _latencies(timing: StreamTimes, headed: Times, receipt: Times) -> str:
 
 def _sort(timing: StreamTimes) -> None:
     """Sort messages by time, with a note where they were not."""
-    for kind, order in _disorders(timing.times):
-        moved = int((order != np.arange(len(order))).sum())
-        timing.notes.append(f"{kind}: {moved} messages out of order were sorted")
-        timing.streams[kind] = timing.streams[kind].select(order)
-        timing.times[kind] = timing.times[kind][order]
-
-
-def _disorders(times: Times) -> Iterator[tuple[str, NDArray[np.intp]]]:
-    for kind, t_ns in list(times.items()):
-        order = in_order(t_ns)
-        if order is not None:
-            yield kind, order
+    for kind, t_ns in timing.times.items():
+        if (late := sorting(t_ns, kind, "messages")) is not None:
+            timing.notes.append(late[1])
+            timing.streams[kind] = timing.streams[kind].select(late[0])
+            timing.times[kind] = t_ns[late[0]]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
-from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.clock import repair_together, sorting
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.recording import ClockJump
@@ -116,11 +116,9 @@ def put_in_time(
     notes, out = [], {}
     for name, rows in parts.items():
         out[name] = NumberRows(rows.path, times[name], rows.values, rows.lines, rows.notes)
-        order = in_order(times[name])
-        if order is not None:
-            moved = int((order != np.arange(len(order))).sum())
-            notes.append(f"{name}: {moved} rows out of order were sorted")
-            out[name] = out[name].select(order)
+        if (late := sorting(times[name], name)) is not None:
+            out[name] = out[name].select(late[0])
+            notes.append(late[1])
     return out, jumps, tuple(notes)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import TimesNs
-from terrafusion.datasets.core.clock import in_order, repair
+from terrafusion.datasets.core.clock import repair, sorting
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.formats import Request
@@ -57,8 +57,8 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
             remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
         )
     repaired, jumps = repair(t_ns, channel)
-    order = in_order(repaired)
-    if order is None:
+    late = sorting(repaired, channel)
+    if late is None:
         return RowTimes(repaired, jumps=jumps)
-    moved = int((order != np.arange(len(order))).sum())
-    return RowTimes(repaired[order], order, jumps, (f"{channel}: {moved} rows out of order were sorted",))
+    order, note = late
+    return RowTimes(repaired[order], order, jumps, (note,))

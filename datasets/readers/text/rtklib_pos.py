@@ -137,8 +137,7 @@ def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
     names: list[str] = []
     for name in header.names:
         names += [f"{name} {part}" for part in "dms"] if name in POSITIONS[DMS][:2] else [name]
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
-    if repeated or not set(POSITIONS[header.kind][1:]) <= set(header.names):
+    if limits.repeated(names) or not set(POSITIONS[header.kind][1:]) <= set(header.names):
         raise DataError("the line of column names is damaged", remedy="write the solution again")
     row = next((x for n, x in head_lines(data) if n > header.line and x.strip() and x[0] != "%"), "")
     cells = split(row, header.separator)
