@@ -24,7 +24,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.csv_table import CsvTable
+from terrafusion.datasets.readers.csv_table import ChannelColumns, CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
@@ -53,13 +53,39 @@ COVARIANCE = {f"cov_{a}_{b}": (i, j) for i, a in enumerate(_POSE) for j, b in en
 """Columns of truth.csv and where they stand in `Trajectory.covariance`; below the diagonal optional."""
 
 
+def wheel_columns(layouts: Layouts) -> tuple[str, ...]:
+    """Columns of speeds and angles of these layouts; a mean speed of both sides has no angle."""
+    turning = [names for names, unit in layouts if (names, unit) != (("speed",), "mps")]
+    speeds = [f"{name}_{unit}" for names, unit in layouts for name in names]
+    return tuple(dict.fromkeys([*speeds, *(f"{name}_rad" for names in turning for name in names)]))
+
+
+COMMAND, CURRENTS, VOLTAGES = ("v_mps", "yaw_rate_radps"), ("left_a", "right_a"), ("left_v", "right_v")
+STEERING = tuple(dict.fromkeys(f"{name}_rad" for names in Steering.LAYOUTS for name in names))
+COLUMNS = {
+    "command": ChannelColumns(COMMAND, required=COMMAND),
+    "wheels": ChannelColumns(wheel_columns(WHEEL_LAYOUTS)),
+    "imu": ChannelColumns((*GYRO, *ACCEL)),
+    "gnss": ChannelColumns(
+        (*GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps"), ("fix",), required=GNSS_POSITION
+    ),
+    "motor": ChannelColumns((*CURRENTS, *VOLTAGES), required=CURRENTS),
+    "terrain": ChannelColumns((), ("label",), ("p_",), required=("label",)),
+    "barometer": ChannelColumns(("pressure_pa",), required=("pressure_pa",)),
+    "magnetometer": ChannelColumns(FIELD, required=FIELD),
+    "steering": ChannelColumns(STEERING),
+    "truth": ChannelColumns(
+        ("x_m", "y_m", "z_m", *QUATERNION, *TRUTH_TWIST, *COVARIANCE), required=("x_m", "y_m")
+    ),
+}
+"""Of the log folder, by channel."""
+
+
 class TableSource(Protocol):
     """Where the tables come from."""
 
-    def table(
-        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> CsvTable | None:
-        """The table of a channel, None where there is none; columns as in `read_table`."""
+    def table(self, channel: str) -> CsvTable | None:
+        """The table of a channel with columns of `COLUMNS`, None where there is none."""
 
     def place(self, channel: str) -> Path:
         """The file the channel is in, for messages."""
@@ -75,17 +101,11 @@ class ChannelReader:
         self.notes: list[str] = list(meta.remarks)
 
     def command(self) -> Command | None:
-        names = ("v_mps", "yaw_rate_radps")
-        table = self._table("command", names, required=names)
-        if table is None:
-            return None
-        return Command(self._t(table), table.numbers["v_mps"], table.numbers["yaw_rate_radps"])
+        table = self._table("command")
+        return None if table is None else Command(self._t(table), *(table.numbers[name] for name in COMMAND))
 
     def wheels(self) -> Wheels | None:
-        known = dict.fromkeys(f"{n}_{unit}" for names, unit in self.layouts for n in names)
-        turning = [names for names, unit in self.layouts if (names, unit) != (("speed",), "mps")]
-        angles = dict.fromkeys(f"{n}_rad" for names in turning for n in names)
-        table = self._table("wheels", [*known, *angles])
+        table = self._table("wheels")
         if table is None:
             return None
         names, unit = self._wheel_layout(table)
@@ -117,7 +137,7 @@ class ChannelReader:
         raise self._error("wheels", what, f"give one of: {layouts}")
 
     def imu(self) -> Imu | None:
-        table = self._table("imu", [*GYRO, *ACCEL])
+        table = self._table("imu")
         if table is None:
             return None
         if not table.numbers:
@@ -125,8 +145,7 @@ class ChannelReader:
         return Imu(self._t(table), table.stack(GYRO), table.stack(ACCEL))
 
     def gnss(self) -> Gnss | None:
-        numeric = [*GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps"]
-        table = self._table("gnss", numeric, required=GNSS_POSITION, texts=("fix",))
+        table = self._table("gnss")
         if table is None:
             return None
         has = table.numbers.__contains__
@@ -161,17 +180,16 @@ class ChannelReader:
         return np.array([codes[word] for word in words], dtype=np.uint8)[inverse]
 
     def motor(self) -> Motor | None:
-        names = ("left_a", "right_a", "left_v", "right_v")
-        table = self._table("motor", names, required=names[:2])
+        table = self._table("motor")
         if table is None:
             return None
-        voltages = [name for name in names[2:] if name in table.numbers]
+        voltages = [name for name in VOLTAGES if name in table.numbers]
         if len(voltages) == 1:
             raise self._error("motor", f"'{voltages[0]}' comes alone", "give both voltages or none")
-        return Motor(self._t(table), table.stack(names[:2]), table.stack(names[2:]) if voltages else None)
+        return Motor(self._t(table), table.stack(CURRENTS), table.stack(VOLTAGES) if voltages else None)
 
     def terrain(self) -> Terrain | None:
-        table = self._table("terrain", (), texts=("label",), prefixes=("p_",), required=("label",))
+        table = self._table("terrain")
         if table is None:
             return None
         return Terrain(
@@ -184,7 +202,7 @@ class ChannelReader:
 
     def steering(self) -> Steering | None:
         layouts = [tuple(f"{name}_rad" for name in names) for names in Steering.LAYOUTS]
-        table = self._table("steering", [*dict.fromkeys(column for layout in layouts for column in layout)])
+        table = self._table("steering")
         if table is None:
             return None
         for names, layout in zip(Steering.LAYOUTS, layouts, strict=True):
@@ -194,16 +212,15 @@ class ChannelReader:
         raise self._error("steering", what, f"give one of: {' | '.join(map(', '.join, layouts))}")
 
     def barometer(self) -> Barometer | None:
-        table = self._table("barometer", ("pressure_pa",), required=("pressure_pa",))
+        table = self._table("barometer")
         return None if table is None else Barometer(self._t(table), table.numbers["pressure_pa"])
 
     def magnetometer(self) -> Magnetometer | None:
-        table = self._table("magnetometer", FIELD, required=FIELD)
+        table = self._table("magnetometer")
         return None if table is None else Magnetometer(self._t(table), table.stack(FIELD))
 
     def truth(self) -> Trajectory | None:
-        names = ["x_m", "y_m", "z_m", *QUATERNION, *TRUTH_TWIST, *COVARIANCE]
-        table = self._table("truth", names, required=("x_m", "y_m"))
+        table = self._table("truth")
         if table is None:
             return None
         quaternion = self._quaternion(table)
@@ -249,20 +266,16 @@ class ChannelReader:
     def _t(self, table: CsvTable) -> NDArray[np.int64]:
         return table.t_ns + np.int64(self.meta.start_ns)
 
-    def _table(
-        self,
-        channel: str,
-        known: Sequence[str],
-        *,
-        required: Sequence[str] = (),
-        texts: Sequence[str] = (),
-        prefixes: Sequence[str] = (),
-    ) -> CsvTable | None:
-        """The channel's rows that hold a value, or None when the file is absent or has none."""
-        table = self.source.table(channel, known, texts, prefixes)
+    def _table(self, channel: str, required: Sequence[str] | None = None) -> CsvTable | None:
+        """The channel's rows that hold a value, or None when the file is absent or has none.
+
+        `required` columns are those of `COLUMNS` unless given.
+        """
+        table = self.source.table(channel)
         if table is None:
             return None
         self.notes.extend(table.notes)
+        required = COLUMNS[channel].required if required is None else required
         missing = [name for name in required if name not in table.numbers and name not in table.texts]
         if missing:
             what = f"column '{missing[0]}' is missing"

@@ -1,27 +1,42 @@
 """One channel's CSV of a log folder: strict header, times exact to the nanosecond."""
 
 import csv
+import dataclasses
 import difflib
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
-from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
+from terrafusion.datasets.readers.delimited import Columns, TextLayout, not_a_table, read_columns, read_text
 
 MAX_T_S = 1e9
 """A |t_s| beyond this (32 years) is a Unix time, not seconds from the start."""
 
 
-@dataclass(frozen=True, eq=False)
-class CsvTable:
+@dataclass(frozen=True)
+class ChannelColumns:
+    """Columns that the table of a channel may have, beside `t_s`.
+
+    Attributes:
+        numbers, texts: names of numeric columns and of texts.
+        prefixes: numeric columns that start with one of these are known, too.
+        required: those that must be there.
+    """
+
+    numbers: tuple[str, ...]
+    texts: tuple[str, ...] = ()
+    prefixes: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CsvTable(Columns):
     """The rows of one CSV.
 
     Attributes:
@@ -32,40 +47,20 @@ class CsvTable:
     """
 
     t_ns: TimesNs
-    numbers: dict[str, Array]
-    texts: dict[str, NDArray[Any]]
-    notes: tuple[str, ...] = ()
 
-    def stack(self, names: Sequence[str]) -> Array:
-        """Columns `names` side by side (N, k); a column the file does not have is NaN."""
-        missing = np.full(len(self.t_ns), np.nan)
-        return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
+    def __len__(self) -> int:
+        return len(self.t_ns)
 
-    def select(self, rows: NDArray[Any]) -> "CsvTable":
+    def select(self, rows: Any) -> Self:
         """The rows of a boolean mask or index array."""
-        return CsvTable(
-            self.t_ns[rows],
-            {name: column[rows] for name, column in self.numbers.items()},
-            {name: column[rows] for name, column in self.texts.items()},
-            self.notes,
-        )
+        return dataclasses.replace(super().select(rows), t_ns=self.t_ns[rows])
 
 
-def read_table(
-    path: Path,
-    known: Iterable[str],
-    *,
-    texts: Sequence[str] = (),
-    prefixes: Sequence[str] = (),
-    in_order: bool = True,
-) -> CsvTable:
+def read_table(path: Path, known: ChannelColumns, *, in_order: bool = True) -> CsvTable:
     """Read one channel's `.csv` or `.csv.gz`.
 
     Args:
         path: the file; its first column set must hold `t_s`.
-        known: names of the numeric columns the channel may have.
-        texts: names of the text columns it may have.
-        prefixes: numeric columns that start with one of these are known too.
         in_order: refuse times that run backwards.
 
     Raises:
@@ -75,35 +70,34 @@ def read_table(
             or looks like Unix time. The message names file, column, line and time.
     """
     with errors_of(path):
-        return _read(path, [*known], texts, prefixes, in_order=in_order)
+        return _read(path, known, in_order)
 
 
-def _read(
-    path: Path, known: list[str], texts: Sequence[str], prefixes: Sequence[str], *, in_order: bool
-) -> CsvTable:
+def _read(path: Path, known: ChannelColumns, in_order: bool) -> CsvTable:
     data = read_text(path)
-    header = _header(data, known, texts, prefixes)
+    header = _header(data, known)
     layout = TextLayout(tuple(header), ",", 2, time="t_s", strict=True)
-    words = [name for name in header if name in texts]
+    words = [name for name in header if name in known.texts]
     table = read_columns(path, data, layout, [n for n in header if n not in (*words, "t_s")], ["t_s", *words])
     t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
     _check_times(t_ns, in_order=in_order)
-    return CsvTable(t_ns, table.numbers, {name: table.texts[name] for name in words}, table.notes)
+    texts = {name: table.texts[name] for name in words}
+    return CsvTable(t_ns=t_ns, numbers=table.numbers, texts=texts, notes=table.notes)
 
 
-def _header(data: bytes, known: list[str], texts: Sequence[str], prefixes: Sequence[str]) -> list[str]:
+def _header(data: bytes, known: ChannelColumns) -> list[str]:
     try:
         header = [name.strip() for name in next(csv.reader([data.split(b"\n", 1)[0].decode()]), [])]
     except csv.Error as error:
         raise not_a_table(1, error) from None
     limits.check_columns(len(header))
-    allowed = ["t_s", *known, *texts]
+    allowed = ["t_s", *known.numbers, *known.texts]
     for name in header:
-        if name in allowed or any(name.startswith(p) and name != p for p in prefixes):
+        if name in allowed or any(name.startswith(p) and name != p for p in known.prefixes):
             continue
         close = difflib.get_close_matches(name[:100], allowed, n=1)
         meant = f"did you mean '{close[0]}'? " if close else ""
-        listed = ", ".join([*allowed, *(f"{p}<name>" for p in prefixes)])
+        listed = ", ".join([*allowed, *(f"{p}<name>" for p in known.prefixes)])
         raise DataError(f"unknown column '{shown(name)}'", remedy=f"{meant}allowed: {listed}")
     repeated = limits.repeated(header)
     if repeated:
@@ -115,7 +109,7 @@ def _header(data: bytes, known: list[str], texts: Sequence[str], prefixes: Seque
 
 def read_times(path: Path) -> TimesNs:
     """The times of a table as they stand there, in any order; errors as in `read_table`."""
-    return read_table(path, (), texts=("fix", "label"), prefixes=("",), in_order=False).t_ns
+    return read_table(path, ChannelColumns((), ("fix", "label"), ("",)), in_order=False).t_ns
 
 
 def _check_times(t_ns: TimesNs, *, in_order: bool) -> None:

@@ -11,10 +11,10 @@ import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,16 +68,13 @@ class TextLayout:
         return seconds if np.isfinite(seconds) else None
 
 
-@dataclass(frozen=True, eq=False)
-class TextTable:
-    """Columns read from a file: `numbers` (N,) float, NaN where missing; `texts` (N,) str."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Columns:
+    """Columns of a table by name: `numbers` (N,) float, NaN where missing, and `texts` (N,) str; notes."""
 
-    path: Path
-    layout: TextLayout
-    data: bytes
     numbers: dict[str, Array]
     texts: dict[str, NDArray[Any]]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter([*self.numbers.values(), *self.texts.values()]), ()))
@@ -86,6 +83,19 @@ class TextTable:
         """Columns `names` side by side (N, k); a column the file does not have is NaN."""
         missing = np.full(len(self), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
+
+    def select(self, rows: Any) -> Self:
+        """The rows of a boolean mask, slice or index array."""
+        numbers = {name: column[rows] for name, column in self.numbers.items()}
+        return replace(self, numbers=numbers, texts={name: c[rows] for name, c in self.texts.items()})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TextTable(Columns):
+    """Columns read from the text of a file."""
+
+    layout: TextLayout
+    data: bytes
 
     def times_ns(self, name: str, unit: str = "s", remedy: str = "") -> TimesNs:
         """A text column of decimal times as nanoseconds (N,).
@@ -210,7 +220,11 @@ def read_columns(
     if table is None:
         raise DataError("cannot be read as a table", remedy="write plain separated numbers")
     columns = TextTable(
-        path, layout, data, {n: table[n] for n in numbers}, {n: table[n] for n in texts}, notes
+        layout=layout,
+        data=data,
+        notes=notes,
+        numbers={n: table[n] for n in numbers},
+        texts={n: table[n] for n in texts},
     )
     if not len(columns) and not layout.strict:
         raise DataError("holds a header but no rows", remedy="record or copy it again")

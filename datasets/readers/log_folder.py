@@ -17,7 +17,7 @@ from terrafusion.datasets.core.clock import repair_together, sorting
 from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.channel_tables import ChannelReader
+from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
 from terrafusion.datasets.readers.csv_table import CsvTable, read_table, read_times
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
@@ -120,15 +120,13 @@ class _Folder:
         self.clocks = clocks or {}
         self.notes: list[str] = []
 
-    def table(
-        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> CsvTable | None:
+    def table(self, channel: str) -> CsvTable | None:
         path = self._path(channel)
         if path is None:
             return None
         if channel not in self.clocks:
-            return read_table(path, known, texts=texts, prefixes=prefixes)
-        table = read_table(path, known, texts=texts, prefixes=prefixes, in_order=False)
+            return read_table(path, COLUMNS[channel])
+        table = read_table(path, COLUMNS[channel], in_order=False)
         table = dataclasses.replace(table, t_ns=self.clocks[channel])
         late = sorting(table.t_ns, channel)
         if late is None:

@@ -8,7 +8,7 @@ cannot hold it to the bit: its stamp (seconds, nanoseconds), then the columns of
 
 import dataclasses
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
+from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, Layouts, wheel_columns
 from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
@@ -146,11 +146,10 @@ class _BagTables:
     def place(self, channel: str) -> Path:
         return self.file
 
-    def table(
-        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> CsvTable | None:
-        columns = self.saved.tables[channel]
-        strange = [c for c in columns if c not in (*known, *texts) and not c.startswith(tuple(prefixes))]
+    def table(self, channel: str) -> CsvTable | None:
+        columns, known = self.saved.tables[channel], COLUMNS[channel]
+        names = {*known.numbers, *known.texts} | ({*wheel_columns(LAYOUTS)} if channel == "wheels" else set())
+        strange = [c for c in columns if c not in names and not c.startswith(known.prefixes)]
         if strange or len(set(columns)) != len(columns):
             raise self._error(channel, f"the columns {', '.join(columns)}")
         stream = self.streams.get(channel)
@@ -166,8 +165,10 @@ class _BagTables:
         if (np.diff(t_ns) < 0).any():
             raise self._error(channel, "stamps that run backwards")
         numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
-        words = {name: self._words(channel, name, numbers.pop(name)) for name in texts if name in numbers}
-        return CsvTable(t_ns, numbers, words)
+        words = {
+            name: self._words(channel, name, numbers.pop(name)) for name in known.texts if name in numbers
+        }
+        return CsvTable(t_ns=t_ns, numbers=numbers, texts=words)
 
     def _words(self, channel: str, column: str, codes: NDArray[np.float64]) -> NDArray[Any]:
         words = self.saved.words.get(column, [])

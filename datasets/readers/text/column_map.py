@@ -9,44 +9,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from terrafusion.datasets.core.channels import Steering
 from terrafusion.datasets.core.config import Prepared, refuse, structure
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.quantity import Quantity, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.datasets.readers.channel_tables import (
-    ACCEL,
-    COVARIANCE,
-    FIELD,
-    GNSS_HEIGHT,
-    GNSS_POSITION,
-    GNSS_VELOCITY,
-    GYRO,
-    QUATERNION,
-    TRUTH_TWIST,
-    WHEEL_LAYOUTS,
-)
+from terrafusion.datasets.readers.channel_tables import COLUMNS
 from terrafusion.datasets.readers.log_meta import DescriptionFile, Meta, parse_meta
 from terrafusion.datasets.readers.text.units import units_of
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
-WHEEL_FIELDS = tuple(dict.fromkeys(f"{n}_{unit}" for names, unit in WHEEL_LAYOUTS for n in names))
-ANGLE_FIELDS = tuple(f"{n}_rad" for n in dict.fromkeys(n for names, _ in WHEEL_LAYOUTS[:-1] for n in names))
-STEERING_FIELDS = tuple(f"{n}_rad" for names in Steering.LAYOUTS for n in names)
-FIELDS: dict[str, tuple[str, ...]] = {
-    "command": ("v_mps", "yaw_rate_radps"),
-    "wheels": (*WHEEL_FIELDS, *ANGLE_FIELDS),
-    "imu": (*GYRO, *ACCEL),
-    "gnss": (*GEODETIC, *GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps", "fix"),
-    "motor": ("left_a", "right_a", "left_v", "right_v"),
-    "terrain": ("label",),
-    "barometer": ("pressure_pa",),
-    "magnetometer": FIELD,
-    "steering": STEERING_FIELDS,
-    "truth": ("x_m", "y_m", "z_m", "yaw_rad", *QUATERNION, *TRUTH_TWIST, *COVARIANCE),
-}
+FIELDS = {channel: (*columns.numbers, *columns.texts) for channel, columns in COLUMNS.items()}
+FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"])
+FIELDS["truth"] = (*FIELDS["truth"][:3], "yaw_rad", *FIELDS["truth"][3:])
 """Fields of each channel: the columns of the log folder, latitude and longitude, and a plain yaw.
 `terrain` also takes p_<class>."""
 
@@ -107,8 +83,8 @@ class ColumnMapFile(DescriptionFile):
 META_KEYS = tuple(f.name for f in dataclasses.fields(DescriptionFile))
 
 
-@dataclass(frozen=True)
-class ColumnMap:
+@dataclass(frozen=True, kw_only=True)
+class ColumnMap(ColumnMapFile):
     """What a table's columns are.
 
     Attributes:
@@ -120,12 +96,6 @@ class ColumnMap:
         meta: what a log folder's meta.yaml may say.
     """
 
-    time: TimeColumn
-    channels: dict[str, dict[str, MappedColumn]]
-    separator: str = ""
-    header: str = "line"
-    imu_axes: tuple[str, ...] = BODY_AXES
-    held: dict[str, float] = field(default_factory=dict)
     meta: Meta = field(default_factory=lambda: Meta(start_ns=0))
 
     def conventions(self) -> Conventions:
@@ -148,8 +118,7 @@ def read_column_map(path: Path) -> ColumnMap:
     found = structure(ColumnMapFile, raw, file=path)
     refuse(_problems(found), path)
     meta = parse_meta({key: raw[key] for key in META_KEYS if key in raw} | {"start_ns": 0}, path)
-    layout = {f.name: getattr(found, f.name) for f in dataclasses.fields(ColumnMap) if f.name != "meta"}
-    return ColumnMap(**layout, meta=meta)
+    return ColumnMap(**vars(found), meta=meta)
 
 
 def contract_map(names: list[str]) -> ColumnMap | None:
@@ -165,7 +134,7 @@ def contract_map(names: list[str]) -> ColumnMap | None:
         channels.setdefault(owners[0], {})[name] = MappedColumn(name)
     if "t_s" not in names or not channels:
         return None
-    return ColumnMap(TimeColumn("t_s", "s", "none"), channels)
+    return ColumnMap(time=TimeColumn("t_s", "s", "none"), channels=channels)
 
 
 def starter_map(names: list[str]) -> str:

@@ -2,14 +2,13 @@
 
 import dataclasses
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
+from terrafusion.datasets.core.arrays import Array, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -49,16 +48,8 @@ MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
 
-class TableColumns(Protocol):
-    """A file's columns, text or Parquet."""
-
-    path: Path
-    names: list[str]
-
-    def read(self, names: list[str]) -> None: ...
-    def numbers(self, name: str) -> Array: ...
-    def texts(self, name: str) -> NDArray[Any]: ...
-    def times_ns(self, name: str, unit: str) -> TimesNs | None: ...
+TableColumns = TextColumns | ParquetColumns
+"""A file's columns."""
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -84,10 +75,9 @@ def read(request: Request) -> list[Recording]:
     path = request.path
     given = request.columns or path.with_name(path.name + MAP_SUFFIX)
     column_map = read_column_map(given) if request.columns or given.is_file() else None
-    columns: TableColumns
     with path.open("rb") as file:
         parquet = file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-    columns = ParquetColumns(path) if parquet else TextColumns(path, column_map)
+    columns: TableColumns = ParquetColumns(path) if parquet else TextColumns(path, column_map)
     notes = [] if column_map is None else [f"columns as {given.name} says"]
     if column_map is None:
         column_map = contract_map(columns.names)
@@ -177,9 +167,7 @@ class _Source:
     def place(self, channel: str) -> Path:
         return self.path
 
-    def table(
-        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> CsvTable | None:
+    def table(self, channel: str) -> CsvTable | None:
         fields = self.found.channels.get(channel, {})
         if not fields:
             return None
@@ -191,7 +179,7 @@ class _Source:
             numbers |= dict(
                 zip(QUATERNION, rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)).T, strict=True)
             )
-        return CsvTable(self.t_ns, numbers, words)
+        return CsvTable(t_ns=self.t_ns, numbers=numbers, texts=words)
 
     def _numbers(self, name: str, of: MappedColumn) -> Array:
         values = self.columns.numbers(of.column)[self.times.order]
@@ -232,7 +220,7 @@ class _Reader(ChannelReader):
         self.datum: Datum | None = meta.datum
 
     def gnss(self) -> Gnss | None:
-        table = self._table("gnss", (), texts=("fix",))
+        table = self._table("gnss", required=())
         if table is None:
             return None
         for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):

@@ -8,7 +8,6 @@ attitude is left out: the output of a filter is not ground truth.
 import dataclasses
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ def read(request: Request) -> list[Recording]:
     columns, settings, notes = _columns(request.path)
     clock = clock_of(columns, settings)
     times = row_times(request, "imu", clock.t_ns)
-    columns = _select(columns, clock.rows, times.order)
+    columns = columns.select(clock.rows).select(times.order)
     notes += [*columns.notes, *clock.notes, *times.notes]
     imu, more = inertial(columns, times.t_ns, settings)
     gnss, datum, of_gnss = _gnss(request, columns, times.t_ns, settings)
@@ -142,14 +141,6 @@ def _unnamed(data: bytes, header: int, separator: str, count: int) -> list[str]:
     """A nameless last column where the rows end with a separator and the header does not."""
     row = next((line for n, line in head_lines(data, header + 20) if n > header and line.strip()), "")
     return [""] if row.endswith(separator) and row.count(separator) == count else []
-
-
-def _select(columns: TextTable, rows: Mask, order: Any) -> TextTable:
-    return dataclasses.replace(
-        columns,
-        numbers={name: values[rows][order] for name, values in columns.numbers.items()},
-        texts={name: values[rows][order] for name, values in columns.texts.items()},
-    )
 
 
 def _device(settings: dict[str, str]) -> str:
