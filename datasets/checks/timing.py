@@ -1,6 +1,7 @@
 """Each clock by itself: span, rate, coarse stamps, jitter, gaps, repeats, steps removed on reading."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -19,7 +20,7 @@ from terrafusion.datasets.checks.finding import (
 )
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.recording import ClockJump, Recording
 
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
 """Channels that are sampled evenly; terrain labels are not."""
@@ -80,18 +81,17 @@ def check_steps(context: CheckContext) -> Iterator[Finding]:
     for name in dict.fromkeys(jump.channel for jump in jumps):
         own = [jump for jump in jumps if jump.channel == name]
         worst = max(own, key=lambda jump: abs(jump.step_s))
-
-        def repair(recording: Recording, name: str = name) -> Recording:
-            left = tuple(jump for jump in recording.clock_jumps if jump.channel != name)
-            return dataclasses.replace(recording, clock_jumps=left)
-
         yield Finding(
             "clock-jump", "error", name,
             f"its clock was set {counted(len(own), 'time')}",
             f"largest step {worst.step_s:+.3f} s at t = {context.since_start_s(np.int64(worst.t_ns)):.2f} s",
             "keep the times as repaired on reading: good to a sampling period",
-            repair,
+            changed("clock_jumps", _without_those_of, channel=name),
         )  # fmt: skip
+
+
+def _without_those_of(jumps: tuple[ClockJump, ...], channel: str) -> tuple[ClockJump, ...]:
+    return tuple(jump for jump in jumps if jump.channel != channel)
 
 
 def check_coarse(context: CheckContext) -> Iterator[Finding]:
@@ -101,23 +101,21 @@ def check_coarse(context: CheckContext) -> Iterator[Finding]:
         if not tick_s:
             continue
         cut = tick_s > 0.99
-
-        def repair(
-            recording: Recording, name: str = name, tick_s: float = tick_s, cut: bool = cut
-        ) -> Recording:
-            t_ns = getattr(recording, name).t_ns
-            even = _even(t_ns, 3.0 * tick_s)
-            late_s = 0.5 * (tick_s - float(np.mean(np.diff(even))) * 1e-9) if cut else 0.0
-            return retimed(recording, name, even + round(late_s * 1e9))
-
         rate_hz = (len(channel) - 1) / max(float(channel.t_ns[-1] - channel.t_ns[0]) * 1e-9, 1e-9)
         yield Finding(
             "coarse-times", "error" if tick_s > 0.1 else "warning", name,
             f"its stamps are {'cut' if cut else 'rounded'} to {tick_s:g} s",
             f"all times are multiples of {tick_s:g} s apart, at {rate_hz:.3g} rows a second",
             f"fit an even clock, taking the stamps as {'cut off' if cut else 'rounded'}",
-            repair,
+            retiming(name, functools.partial(_refined, tick_s=tick_s, cut=cut)),
         )  # fmt: skip
+
+
+def _refined(t_ns: TimesNs, tick_s: float, cut: bool) -> TimesNs:
+    """Even times of stamps that are rounded to a tick, or cut off."""
+    even = _even(t_ns, 3.0 * tick_s)
+    late_s = 0.5 * (tick_s - float(np.mean(np.diff(even))) * 1e-9) if cut else 0.0
+    return np.asarray(even + round(late_s * 1e9))
 
 
 def coarse_tick_s(channel: Channel) -> float:

@@ -71,10 +71,7 @@ def apply(recording: Recording, conventions: Conventions) -> Recording:
 
 
 def _geometry(recording: Recording, c: Conventions) -> Recording:
-    own = {
-        name: getattr(c, name)
-        for name in ("wheel_radius_m", "track_m", "drive", "wheelbase_m", "antenna_m", "imu_m")
-    }
+    own = {name: getattr(c, name, None) for name in vars(recording.overrides)}
     new = {name: value for name, value in own.items() if value is not None}
     return dataclasses.replace(
         recording,

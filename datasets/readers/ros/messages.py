@@ -30,35 +30,34 @@ POSE_AT = {
 ACKERMANN_AT = {topics.ACKERMANN: "", topics.ACKERMANN_STAMPED: "drive."}
 """What stands before the fields of an AckermannDrive."""
 DIAGONAL = range(0, 36, 7)
+_RATE, _FORCE, _SIGMA = "angular_velocity", "linear_acceleration", "position_covariance"
+FIELDS = {
+    topics.IMU: (_RATE, f"{_RATE}_covariance.0", _FORCE, f"{_FORCE}_covariance.0"),
+    topics.FIX: (
+        "status.status", "latitude", "longitude", "altitude",
+        f"{_SIGMA}_type", f"{_SIGMA}.0", f"{_SIGMA}.4", f"{_SIGMA}.8",
+    ),
+    topics.PRESSURE: ("fluid_pressure",),
+    topics.FIELD: ("magnetic_field",),
+    topics.JOINTS: ("name", "position", "velocity"),
+}  # fmt: skip
+"""Paths of the fields that are read of other types."""
 
 
 def wanted_fields(kind: str, msgtype: str) -> tuple[str, ...]:
     """Paths of the fields that a channel takes from messages of a type; () for all of them."""
-    fields = ["header.stamp", "header.frame_id"]
-    if msgtype == topics.IMU:
-        for name in ("angular_velocity", "linear_acceleration"):
-            fields += [name, f"{name}_covariance.0"]
-    elif msgtype == topics.FIX:
-        fields += ["status.status", "latitude", "longitude", "altitude", "position_covariance_type"]
-        fields += [f"position_covariance.{i}" for i in (0, 4, 8)]
-    elif msgtype in (topics.PRESSURE, topics.FIELD):
-        fields.append("fluid_pressure" if msgtype == topics.PRESSURE else "magnetic_field")
-    elif msgtype in ACKERMANN_AT:
+    fields = [*FIELDS.get(msgtype, ())]
+    if msgtype in ACKERMANN_AT:
         fields += [f"{ACKERMANN_AT[msgtype]}{name}" for name in ("steering_angle", "speed")]
-    elif msgtype == topics.JOINTS:
-        fields += ["name", "position", "velocity"]
-    elif msgtype in TWIST_AT or msgtype in POSE_AT:
-        if msgtype in TWIST_AT:
-            twist, variance = TWIST_AT[msgtype]
-            fields += [f"{twist}linear", f"{twist}angular"]
-            fields += [f"{variance}{i}" for i in DIAGONAL if variance]
-        if msgtype in POSE_AT:
-            pose, covariance = POSE_AT[msgtype]
-            fields += [f"{pose}position", f"{pose}orientation", "child_frame_id"]
-            fields += [covariance] if kind == "truth" and covariance else []
-    else:
-        return ()
-    return tuple(fields)
+    if msgtype in TWIST_AT:
+        twist, variance = TWIST_AT[msgtype]
+        fields += [f"{twist}linear", f"{twist}angular"]
+        fields += [f"{variance}{i}" for i in DIAGONAL if variance]
+    if msgtype in POSE_AT:
+        pose, covariance = POSE_AT[msgtype]
+        fields += [f"{pose}position", f"{pose}orientation", "child_frame_id"]
+        fields += [covariance] if kind == "truth" and covariance else []
+    return ("header.stamp", "header.frame_id", *fields) if fields else ()
 
 
 @dataclass(frozen=True, eq=False)

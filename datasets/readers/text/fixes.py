@@ -25,7 +25,8 @@ class Fixes:
 
     Attributes:
         t_ns: (N,) int64, never decreasing.
-        llh: (N, 3) latitude deg, longitude deg, ellipsoidal height m; NaN where unknown.
+        llh: (N, 3) latitude deg, longitude deg, ellipsoidal height m; NaN where unknown. With `local`
+            they are east, north and up of the datum, m.
         fix: (N,) `Fix` values.
         sigma_enu_m: (N, 3), NaN where unknown.
         velocity_enu_mps: (N, 3), NaN where unknown, or None.
@@ -38,12 +39,12 @@ class Fixes:
     sigma_enu_m: Array
     velocity_enu_mps: Array | None = None
     sigma_v_mps: Array | None = None
+    local: bool = False
 
     def select(self, rows: Any) -> "Fixes":
         """The fixes of a boolean mask, slice or index array."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        chosen: dict[str, Any] = {name: None if v is None else v[rows] for name, v in values.items()}
-        return Fixes(**chosen)
+        arrays = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return dataclasses.replace(self, **arrays)
 
 
 def gnss_channel(
@@ -79,13 +80,13 @@ def located(
         DataError: a latitude or longitude that is not on Earth.
     """
     held = np.asarray(np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE))
-    if held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
+    if not fixes.local and held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
         held &= (fixes.llh[:, :2] != 0.0).any(axis=1)
     notes = []
     if not held.all():
         notes.append(f"gnss: {int((~held).sum())} of {len(held)} {rows} hold no fix; left out")
     llh = fixes.llh[held]
-    if not held.any():
+    if fixes.local or not held.any():
         return held, llh, datum, notes
     bad = np.flatnonzero((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
     if bad.size:

@@ -28,7 +28,7 @@ from terrafusion.datasets.readers.delimited import (
     split,
 )
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
@@ -75,7 +75,7 @@ def read(request: Request) -> list[Recording]:
     if b"/geodetic" in data[:4096] and header.kind != BASELINE:
         notes.append("gnss: heights are above the geoid; taken as they are")
     solution = _Solution(request, columns, header, times)
-    gnss, datum, more = solution.baseline() if header.kind == BASELINE else solution.geodetic()
+    gnss, datum, more = solution.channel()
     if gnss is None:
         raise DataError("no row holds a fix", remedy="process the observations again")
     recording = Recording(
@@ -193,60 +193,42 @@ class _Solution:
     def stack(self, *names: str) -> Array:
         return self.columns.stack(names)[self.times.order]
 
-    def baseline(self) -> tuple[Gnss | None, Datum | None, list[str]]:
-        """East, north and up of the base station are ENU about it."""
+    def channel(self) -> tuple[Gnss | None, Datum | None, list[str]]:
+        """The fixes about the base station of a baseline, else about the first of them."""
+        local = self.header.kind == BASELINE
+        fixes = self._ecef() if self.header.kind == ECEF else self._along_axes(local)
+        gnss, datum, more = gnss_channel(self.request, fixes, self._base() if local else None)
+        return gnss, datum, [*self.notes, *more]
+
+    def _base(self) -> Datum | None:
+        """Position of the base station, where the file has it."""
         base = self.header.base
-        datum: Datum | None = None
         if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
-            datum = (base[0], base[1], base[2])
-        else:
-            self.notes.append("gnss: baselines of a base station whose position is not in the file")
-        enu = self.stack(*POSITIONS[BASELINE])
-        held = np.isfinite(enu[:, :2]).all(axis=1) & (self.fix > Fix.NONE)
-        if not held.all():
-            self.notes.append(f"gnss: {int((~held).sum())} of {len(held)} rows hold no fix; left out")
-        if not held.any():
-            return None, None, self.notes
-        sigma, more = with_assumed_sigma(
-            self.request, self.stack("sde(m)", "sdn(m)", "sdu(m)")[held], self.fix[held]
-        )
-        velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")[held]
-        known = bool(np.isfinite(velocity).any())
-        sigma_v = _horizontal(self.stack("sdve", "sdvn")[held]) if known else None
-        gnss = Gnss(
-            self.times.t_ns[held], enu[held], sigma, self.fix[held], velocity if known else None, sigma_v
-        )
-        return gnss, datum, [*self.notes, *more]
+            return base[0], base[1], base[2]
+        self.notes.append("gnss: baselines of a base station whose position is not in the file")
+        return None
 
-    def geodetic(self) -> tuple[Gnss | None, Datum | None, list[str]]:
-        """Latitude, longitude and height, also of ECEF positions."""
-        if self.header.kind == ECEF:
-            fixes = self._ecef()
-        else:
-            velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")
-            fixes = Fixes(
-                self.times.t_ns,
-                np.column_stack([*self._angles(), self.stack("height(m)")[:, 0]]),
-                self.fix,
-                self.stack("sde(m)", "sdn(m)", "sdu(m)"),
-                velocity,
-                _horizontal(self.stack("sdve", "sdvn")),
-            )
-        gnss, datum, more = gnss_channel(self.request, fixes)
-        return gnss, datum, [*self.notes, *more]
+    def _along_axes(self, local: bool) -> Fixes:
+        """Fixes with sigmas and velocities along east, north and up."""
+        place = self.stack(*POSITIONS[BASELINE]) if local else self._llh()
+        sigma, velocity = (
+            self.stack("sde(m)", "sdn(m)", "sdu(m)"),
+            self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)"),
+        )
+        sigma_v = _horizontal(self.stack("sdve", "sdvn"))
+        return Fixes(self.times.t_ns, place, self.fix, sigma, velocity, sigma_v, local)
 
-    def _angles(self) -> tuple[Array, Array]:
-        """Latitude and longitude, deg."""
-        latitude, longitude, _ = POSITIONS[self.header.kind]
+    def _llh(self) -> Array:
+        """Latitude and longitude (deg) and height (m), (N, 3)."""
+        *names, height = POSITIONS[self.header.kind]
         if self.header.kind == DEGREES:
-            both = self.stack(latitude, longitude)
-            return both[:, 0], both[:, 1]
+            return self.stack(*names, height)
         angles = []
-        for name in (latitude, longitude):
+        for name in names:
             degrees, minutes, seconds = self.stack(*(f"{name} {part}" for part in "dms")).T
             sign = np.where(np.signbit(degrees), -1.0, 1.0)  # -0 degrees are south or west too
             angles.append(sign * (np.abs(degrees) + minutes / 60.0 + seconds / 3600.0))
-        return angles[0], angles[1]
+        return np.column_stack([*angles, self.stack(height)[:, 0]])
 
     def _ecef(self) -> Fixes:
         import pymap3d
