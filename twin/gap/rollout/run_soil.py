@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -20,13 +21,13 @@ from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
     RunResiduals,
     WhitenedRun,
-    initial_state_sigma,
+    soil_columns,
     whitened,
     whitened_error,
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 
-MOST_SOIL = 4.0  # limit of a run's soil, in typical sizes from the model's
+MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's
 LIMIT_SIGMAS = 3.0
 """A run's soil is also limited to so many sigmas of the references' soils: what goes beyond is a gap."""
 STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
@@ -34,36 +35,110 @@ STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
 SHORTER, LEAST_STEP = 0.4, 0.1
 """Factor of a step that did not reduce the errors, and the least share of one: a full step goes too far where
 slip grows steeply, and a run that stays where it is would seem to be on the references' soil."""
-EFFECT_SIGMA = 0.3  # 1 sigma of the effects, in typical sizes, while a run's soil is sought
+ALONE = (1.0, 0.3)
+"""1 sigma of a step of one run's soil and of the effects beside it, in typical sizes (assumed)."""
 
 
 @dataclass(eq=False)
-class _SoilSearch:
-    """State of the search for one run's soil (S,): errors there, their square and gradient."""
+class SoilSearch:
+    """Search for the soil (S,) that runs share, in typical sizes from the model's.
 
-    run: RunResiduals
-    white: WhitenedRun
+    Attributes:
+        runs, white: before and after whitening, about the model's soil.
+        errors, white_errors: of each run on the soil found so far, before and after whitening.
+        soil_sigma, effect_sigma: 1 sigma of a step of the soil, and of the effects beside it.
+        share: of a full step.
+        going: whether another step is tried.
+    """
+
+    runs: Sequence[RunResiduals]
+    white: Sequence[WhitenedRun]
     soil: Array
-    errors: list[Array]
-    cost: float
-    gradient: Array
-    share: float = 1.0  # of a full step
+    errors: Sequence[Sequence[Array]]
+    white_errors: Sequence[Array]
+    soil_sigma: float
+    effect_sigma: float
+    share: float = 1.0
     going: bool = True
 
+    @classmethod
+    def of(
+        cls, runs: Sequence[RunResiduals], noise: Mapping[str, ResidualNoise], soil_sigma: float,
+        effect_sigma: float,
+    ) -> Self:  # fmt: skip
+        """From the model's soil on."""
+        white = [whitened(run.without_nuisance(), noise) for run in runs]
+        errors = [run.error for run in runs]
+        return cls(runs, white, runs[0].soil, errors, [w.error for w in white], soil_sigma, effect_sigma)
+
+    def cost(self) -> float:
+        """Square of the whitened errors."""
+        return sum(float(e @ e) for e in self.white_errors)
+
+    def step(self, candidates: Candidates) -> Array:
+        """Step (S,) of the soil; effects and the sensor states of each run take part as nuisances."""
+        S, T, K = len(self.soil), self.white[0].states, len(candidates.keys)
+        others = [T + k for k in range(K) if k not in soil_columns(candidates)]
+        mine, states = np.array([*range(S), *others]), np.arange(S, T)
+        sigma = np.repeat([self.soil_sigma, self.effect_sigma], [S, len(others)])
+        H, gradient = np.diag(sigma**-2.0), np.zeros(len(mine))
+        for white, error in zip(self.white, self.white_errors, strict=True):
+            G, gain = white.gram, white.rows[:, :-1].astype(float).T @ error
+            cross = G[np.ix_(states, mine)]
+            both = np.column_stack([cross, gain[states]])
+            own = np.linalg.solve(G[np.ix_(states, states)] + np.eye(T - S), both)
+            H += G[np.ix_(mine, mine)] - cross.T @ own[:, :-1]
+            gradient += gain[mine] - cross.T @ own[:, -1]
+        return np.asarray(self.share * np.linalg.solve(H, gradient)[:S])
+
     def accept_if_better(
-        self, soil: Array, predicted: Sequence[Array] | None, noise: Mapping[str, ResidualNoise]
+        self, soil: Array, predicted: Sequence[Sequence[Array] | None], noise: Mapping[str, ResidualNoise]
     ) -> None:
-        if predicted is not None:
-            error = [o.value - y for o, y in zip(self.run.log.observed, predicted, strict=True)]
-            white = whitened_error(self.run, self.white, noise, error)
-            now, before = float(white @ white), self.cost
+        """Goes to a soil where its predictions are better, one array a channel of each run."""
+        known = [values for values in predicted if values is not None]
+        if len(known) == len(self.runs):
+            errors = [errors_of(run, values) for run, values in zip(self.runs, known, strict=True)]
+            parts = zip(self.runs, self.white, errors, strict=True)
+            white = [whitened_error(run, w, noise, error) for run, w, error in parts]
+            now, before = sum(float(e @ e) for e in white), self.cost()
             if now < before:
-                self.gradient = self.white.rows[:, :-1].astype(float).T @ white
-                self.soil, self.errors, self.cost = soil, error, now
-                self.going = ENOUGH * before >= now >= GOOD * len(self.white.time_s)
+                self.soil, self.errors, self.white_errors = soil, errors, white
+                self.going = ENOUGH * before >= now >= GOOD * sum(map(len, white))
                 return
         self.share *= SHORTER
         self.going = self.share >= LEAST_STEP
+
+
+def search_soil(
+    searches: Sequence[SoilSearch],
+    cache: LinearisationCache,
+    noise: Mapping[str, ResidualNoise],
+    limit: Array | float = MOST_SOIL,
+    jobs: int = 1,
+) -> None:
+    """Take the searches to their ends.
+
+    Args:
+        limit: of the soil (S,), in typical sizes from the model's.
+    """
+
+    def next_soil(search: SoilSearch) -> tuple[dict[str, float], Array]:
+        soil = search.soil + search.step(cache.candidates)
+        return with_run_soil(np.clip(soil, -limit, limit), cache, {})
+
+    with ThreadPoolExecutor(jobs) as threads:
+        for _ in range(STEPS):
+            going = [search for search in searches if search.going]
+            tried = list(threads.map(next_soil, going))
+            rollouts = [
+                Rollout(run.log, effects)
+                for search, (effects, _) in zip(going, tried, strict=True)
+                for run in search.runs
+            ]
+            found = iter(aligned_predictions(rollouts, cache.model, cache.candidates, jobs))
+            predicted = [[next(found) for _ in search.runs] for search in going]
+            soils, same = [soil for _, soil in tried], [noise] * len(going)
+            list(threads.map(SoilSearch.accept_if_better, going, soils, predicted, same))
 
 
 def at_run_soil(
@@ -73,38 +148,24 @@ def at_run_soil(
     limit: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> list[RunResiduals]:
-    """Runs with errors linearised about their own soil.
-
-    Args:
-        limit: of the soil (S,), in typical sizes from the model's.
-    """
-
-    def start(run: RunResiduals) -> _SoilSearch:
-        white = whitened(run.without_nuisance(), noise)
-        return _SoilSearch(run, white, run.soil, run.error, float(white.gram[-1, -1]), white.gram[:-1, -1])
-
-    def next_soil(search: _SoilSearch) -> tuple[dict[str, float], Array]:
-        step = search.share * _soil_step(search.white, search.gradient, cache.candidates, len(search.soil))
-        return with_run_soil(np.clip(search.soil + step, -limit, limit), cache, {})
-
+    """Runs with errors linearised about their own soil; `limit` as for `search_soil`."""
     with ThreadPoolExecutor(jobs) as threads:
-        searches = list(threads.map(start, runs))
-        for _ in range(STEPS):
-            going = [search for search in searches if search.going]
-            tried = list(threads.map(next_soil, going))
-            rollouts = [Rollout(s.run.log, effects) for s, (effects, _) in zip(going, tried, strict=True)]
-            found = aligned_predictions(rollouts, cache.model, cache.candidates, jobs)
-            soils, same = [soil for _, soil in tried], [noise] * len(found)
-            list(threads.map(_SoilSearch.accept_if_better, going, soils, found, same))
+        searches = list(threads.map(lambda run: SoilSearch.of([run], noise, *ALONE), runs))
+    search_soil(searches, cache, noise, limit, jobs)
     return [
-        dataclasses.replace(s.run, soil=s.soil, error=referred_to_model(s.run, s.soil, s.errors))
-        for s in searches
+        dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.errors[0]))
+        for run, s in zip(runs, searches, strict=True)
     ]
 
 
 def referred_to_model(run: RunResiduals, soil: Array, errors: Sequence[Array]) -> list[Array]:
     """Errors on the run's soil (S,) as they would be on the model's, to first order."""
     return [e + s[:, : len(soil)] @ soil for e, s in zip(errors, run.by_state, strict=True)]
+
+
+def errors_of(run: RunResiduals, predicted: Sequence[Array]) -> list[Array]:
+    """What a run measured less predictions, one array a channel."""
+    return [o.value - y for o, y in zip(run.log.observed, predicted, strict=True)]
 
 
 def with_run_soil(
@@ -128,13 +189,3 @@ def soil_limit(references: Sequence[RunResiduals], candidates: Candidates) -> Ar
     first = np.array([sigma for name, sigma in SOIL_SIGMAS.items() if name in candidates.keys])
     squares = sum((run.soil**2 for run in references), first**2)
     return np.minimum(LIMIT_SIGMAS * np.sqrt(squares / (1 + len(references))), MOST_SOIL)
-
-
-def _soil_step(white: WhitenedRun, gradient: Array, candidates: Candidates, count: int) -> Array:
-    """Step of the soil (S,), in typical sizes, by inner products of columns and error; effects take part as
-    nuisances of small size."""
-    sigma = initial_state_sigma(candidates)
-    prior = np.concatenate([sigma**-2.0, np.full(len(candidates.keys), EFFECT_SIGMA**-2.0)])
-    prior[:count] = 1.0
-    K = len(prior)
-    return np.asarray(np.linalg.solve(white.gram[:K, :K] + np.diag(prior), gradient)[:count])

@@ -10,9 +10,8 @@ import pytest
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.rollout import run_soil
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, clip_outliers
-from terrafusion.twin.gap.rollout.run_soil import soil_limit
+from terrafusion.twin.gap.rollout.run_soil import SoilSearch, soil_limit
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs
 
@@ -41,8 +40,8 @@ def test_a_search_that_steps_too_far_tries_a_shorter_step_and_is_the_same_for_ju
 ) -> None:
     """Slip grows steeply as the ground gets weaker: a run whose full step went too far stayed on the
     references' ground, and one with a limit, which shortens the step, did not."""
-    step = run_soil._soil_step
-    monkeypatch.setattr(run_soil, "_soil_step", lambda *given: 8.0 * step(*given))
+    step = SoilSearch.step
+    monkeypatch.setattr(SoilSearch, "step", lambda *given: 8.0 * step(*given))
     found = gather_evidence(
         runs(990, 1), runs(990, 3), load_vehicle("elevate"), None, evidence.candidates, jobs=2
     )
