@@ -27,7 +27,7 @@ from terrafusion.twin.calibrate.start import (
     start_model,
     uniquely_named,
 )
-from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, load_vehicle, reported_geometry
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
 PARAMETERS = (
@@ -92,7 +92,7 @@ def calibrate(
         checked_number(value, _GROUND[key], file="the calibration", key=key)
     # The model to start from, and its unknown parameters.
     robot = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
-    model, ground = start_model(logs_in, robot, soils, effects or {})
+    model, ground, notes = start_model(logs_in, robot, soils, effects)
     model = dataclasses.replace(
         model, slope_rad=math.radians(slope_deg), aspect_rad=math.radians(aspect_deg), payload_kg=payload_kg
     )
@@ -108,7 +108,6 @@ def calibrate(
     problem = Problem(logs, model, coordinates, robust=robust)
     solution, covariance, identified = _search(problem, progress)
     # The answer.
-    notes = [*geometry_notes(robot, reported_geometry(logs_in))]
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return answer_of(problem, solution, covariance, identified, notes)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.calibrate.observations import Observed
 
 Rows = NDArray[np.int64]
 
@@ -84,6 +85,14 @@ def _factor(rho: tuple[float, ...], steps: tuple[int, ...]) -> Array:
 def gauss_markov(share: float, time_s: float, slot_s: float, lags: int) -> tuple[float, ...]:
     """Autocorrelation at `lags` lags of noise whose variance is Gauss-Markov for `share` of it."""
     return (1.0, *(share * math.exp(-lag * slot_s / time_s) for lag in range(1, lags)))
+
+
+def sheet_correlation(observed: Observed, lags: int) -> tuple[float, ...] | None:
+    """Autocorrelation of a channel by its data sheet's time constant, None without one."""
+    if observed.correlation is None:
+        return None
+    share, time_s = observed.correlation
+    return gauss_markov(share, time_s, observed.slot_s, lags)
 
 
 def autoregressive(series: Sequence[tuple[Rows, Array]], lags: int) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, sheet_correlation
 from terrafusion.twin.calibrate.problem import Key, NoiseModel, Normal, Problem, ResidualBlock
 
 MAX_EXTRAPOLATION = 0.2
@@ -18,9 +18,9 @@ MAX_EXTRAPOLATION = 0.2
 def first_noise(problem: Problem) -> NoiseModel:
     """Noise of the data sheets, with their time constants where they give any."""
     return {
-        (i, j): ResidualNoise(1.0, _sheet_correlation(problem, i, j) or (1.0,))
+        (i, j): ResidualNoise(1.0, sheet_correlation(o, _lags(problem, i, j)) or (1.0,))
         for i, log in enumerate(problem.logs)
-        for j in range(len(log.observed))
+        for j, o in enumerate(log.observed)
     }
 
 
@@ -31,10 +31,11 @@ def learnt_noise(
     learnt: NoiseModel = {}
     for (i, j), mine in by_channel(blocks).items():
         observed = problem.logs[i].observed[j]
-        rho = _sheet_correlation(problem, i, j)
+        lags = _lags(problem, i, j)
+        rho = sheet_correlation(observed, lags)
         if rho is None:
             series = [(observed.slot[b.rows], clipped(b.residual / observed.sigma[b.rows])) for b in mine]
-            rho = autoregressive(series, _lags(problem, i, j))
+            rho = autoregressive(series, lags)
         learnt[i, j] = ResidualNoise(1.0, rho)
     return rescaled(problem, blocks, normal, learnt)
 
@@ -79,15 +80,6 @@ def by_channel(blocks: Sequence[ResidualBlock]) -> dict[Key, list[ResidualBlock]
 
 def _least(problem: Problem, key: Key) -> float:
     return problem.logs[key[0]].observed[key[1]].least
-
-
-def _sheet_correlation(problem: Problem, i: int, j: int) -> tuple[float, ...] | None:
-    """Autocorrelation by a data sheet's time constant, None without one."""
-    observed = problem.logs[i].observed[j]
-    if observed.correlation is None:
-        return None
-    share, time_s = observed.correlation
-    return gauss_markov(share, time_s, observed.slot_s, _lags(problem, i, j))
 
 
 def _lags(problem: Problem, i: int, j: int) -> int:

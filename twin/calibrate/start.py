@@ -12,7 +12,7 @@ from terrafusion.twin.calibrate.log import PreparedLog, grounds
 from terrafusion.twin.calibrate.model import Model, resolve
 from terrafusion.twin.calibrate.predict import FOLLOWING
 from terrafusion.twin.model.soil import SoilParams, load_soil
-from terrafusion.twin.model.vehicle import VehicleParams, reported_geometry, with_overrides
+from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, reported_geometry, with_overrides
 
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
 
@@ -28,43 +28,51 @@ def uniquely_named(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 
 def start_model(
-    recordings: Sequence[Recording], vehicle: VehicleParams, soils: Soils, effects: Mapping[str, float]
-) -> tuple[Model, str | None]:
-    """The model to start from, and the name of the one ground where there is one for all logs.
+    recordings: Sequence[Recording],
+    vehicle: VehicleParams,
+    soils: Soils,
+    effects: Mapping[str, float] | None = None,
+    stand_in: str | None = None,
+) -> tuple[Model, str | None, list[str]]:
+    """The model to start from, the name of the one ground where there is one for all logs, and notes.
+
+    Args:
+        effects: of the twin, besides those of the vehicle.
+        stand_in: soil of a ground that is none of the library; None: it is refused.
 
     Raises:
         ConfigError: an unknown soil, or one for a ground that no log has.
-        DataError: a ground that is no soil of the library.
+        DataError: a ground that is no soil of the library; logs of different geometries.
     """
-    robot = with_overrides(vehicle, reported_geometry(recordings))
-    present = {**vehicle.effects, **effects}
+    geometry = reported_geometry(recordings)
+    robot, notes = with_overrides(vehicle, geometry), list(geometry_notes(vehicle, geometry))
+    present = {**vehicle.effects, **(effects or {})}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
-        return Model(robot, {soil.name: soil}, present), soil.name
-    given, found = dict(soils or {}), {}
+        return Model(robot, {soil.name: soil}, present), soil.name, notes
+    given, found = dict(soils or {}), dict[str, SoilParams]()
     for recording in recordings:
-        for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
-            if label not in found:
-                found[label] = _soil(given.get(label, label), label, recording)
-    if unmet := sorted(set(given) - set(found)):
+        for label in (x for x in grounds(recording, recording.start_ns)[0] if x not in found):
+            named = given.get(label, label)
+            try:
+                found[label] = named if isinstance(named, SoilParams) else load_soil(named)
+            except ConfigError:
+                if label in given:
+                    raise
+                if stand_in is None:
+                    raise _no_soil(label, recording) from None
+                found[label] = load_soil(stand_in)
+                notes.append(f"the ground '{label}' is not in the library: {stand_in} stands in")
+    if stand_in is None and (unmet := sorted(set(given) - set(found))):
         raise ConfigError(
             f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {', '.join(found)}"
         )
-    return Model(robot, found, present), None
+    return Model(robot, found, present), None, notes
 
 
-def _soil(given: str | Path | SoilParams, label: str, recording: Recording) -> SoilParams:
-    if isinstance(given, SoilParams):
-        return given
-    try:
-        return load_soil(given)
-    except ConfigError:
-        if given != label:
-            raise
-        what = f"its ground '{label}' is no soil of the library" if label else "it does not say its ground"
-        raise DataError(
-            what, file=recording.name, channel="terrain", remedy="name the soil with --terrain"
-        ) from None
+def _no_soil(label: str, recording: Recording) -> DataError:
+    what = f"its ground '{label}' is no soil of the library" if label else "it does not say its ground"
+    return DataError(what, file=recording.name, channel="terrain", remedy="name the soil with --terrain")
 
 
 def coordinates_of(names: Sequence[str], model: Model, priors: Mapping[str, Prior]) -> list[Coordinate]:

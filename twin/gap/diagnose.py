@@ -13,13 +13,14 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
+from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import Planner
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
 from terrafusion.twin.gap.answer.verdict import judge
 from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import Soils, check_distinct
+from terrafusion.twin.gap.data.logs import check_distinct
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit

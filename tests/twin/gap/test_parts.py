@@ -16,7 +16,7 @@ from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.gap.answer.verdict import null_probability
 from terrafusion.twin.gap.answer.where import permutations
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
 from terrafusion.twin.gap.null.score import score
@@ -39,8 +39,8 @@ CANDIDATES = Candidates.of()
 @pytest.fixture(scope="module")
 def log_and_model():
     recording = run(1)
-    model, ground, _ = starting_model([recording], load_vehicle("elevate"), None)
-    return prepared([recording], model, ground, "auto")[0], model
+    (log,), model, _ = prepared([recording], load_vehicle("elevate"), None)
+    return log, model
 
 
 @pytest.mark.parametrize(("short", "within"), [(False, 1e-8), (True, 2e-6)])
@@ -243,15 +243,15 @@ def test_the_geometry_that_logs_tell_is_said_and_has_to_be_one() -> None:
     vehicle = load_vehicle("elevate")
     plain = run(3)
     told = dataclasses.replace(plain, name="told", overrides=Overrides(wheel_radius_m=0.17))
-    model, _, notes = starting_model([told, told], vehicle, None)
+    _, model, notes = prepared([told, told], vehicle, None)
     assert model.vehicle.wheel.radius_m == 0.17
     assert notes == ["the log's own geometry is used: wheel_radius_m = 0.17"]
-    assert starting_model([plain], vehicle, None)[2] == []
+    assert prepared([plain], vehicle, None)[2] == []
     another = (
         rf"told: it reports another geometry .* \(wheel_radius_m = 0.17\) than {plain.name} \(none\); give"
     )
     with pytest.raises(DataError, match=another):
-        starting_model([plain, told], vehicle, None)
+        prepared([plain, told], vehicle, None)
 
 
 def test_scores_are_those_of_the_whole_covariance(log_and_model) -> None:

@@ -63,7 +63,7 @@ class GapDiagnosis:
     @property
     def seconds(self) -> float:
         """Length of the judged runs."""
-        return sum(r.seconds for r in self.evidence.runs)
+        return sum(r.log.seconds() for r in self.evidence.runs)
 
     @property
     def detected(self) -> bool:

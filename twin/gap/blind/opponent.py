@@ -19,7 +19,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model, with_common_channels
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
@@ -147,8 +147,7 @@ def joint_least_squares(
     if len(references) < FEWEST_REFERENCES:
         raise DataError(f"{len(references)} references", remedy=f"give at least {FEWEST_REFERENCES}")
     candidates = first_forms(Candidates.of())
-    model, soil, _ = starting_model([*runs, *references], vehicle, None)
-    logs = with_common_channels(prepared([*runs, *references], model, soil, "auto"))
+    logs, model, _ = prepared([*runs, *references], vehicle, None)
     judged, normal = logs[: len(runs)], logs[len(runs) :]
     fit = _Fit(model, candidates)
     base = fit.calibrated(normal[:CALIBRATION_RUNS])

@@ -64,10 +64,8 @@ class ReferenceGains:
         if count - size < FEWEST or not size:
             return cls((), {}, 0.0)
         references = evidence.references[: GROUPS * size]
-        there = dataclasses.replace(
-            evidence, runs=references, residuals=evidence.reference_residuals[: GROUPS * size], references=[]
-        )
-        soils = [residuals.soil for residuals in there.residuals]
+        there = dataclasses.replace(evidence, runs=references, references=[])
+        soils = [run.residuals.soil for run in references]
         at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in linear}
         points = [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x]
         bank = SignatureBank.empty(there).with_sizes(there, points)

@@ -39,7 +39,7 @@ def whitened_errors(
     evidence: GapEvidence, tried: Sequence[RunWithEffects], clip: bool = True
 ) -> list[Array | None]:
     """Whitened errors of the judged runs against the twin with these effects; None where it diverges."""
-    soils = [evidence.residuals[t.run].soil if t.soil is None else t.soil for t in tried]
+    soils = [evidence.runs[t.run].residuals.soil if t.soil is None else t.soil for t in tried]
     applied = [with_run_soil(s, evidence.cache, t.effects) for t, s in zip(tried, soils, strict=True)]
     rollouts = [
         Rollout(evidence.runs[t.run].log, effects) for t, (effects, _) in zip(tried, applied, strict=True)
@@ -47,13 +47,11 @@ def whitened_errors(
     predicted = aligned_predictions(rollouts, evidence.model, evidence.candidates, evidence.jobs)
 
     def whitened(i: int) -> Array | None:
-        y, k = predicted[i], tried[i].run
+        y, run = predicted[i], evidence.runs[tried[i].run]
         if y is None:
             return None
-        run, residuals = evidence.runs[k], evidence.residuals[k]
-        error = [o.value - value for o, value in zip(run.log.observed, y, strict=True)]
-        error = referred_to_model(residuals, applied[i][1], error)
-        return whitened_error(residuals, run, evidence.noise, error, clip)
+        error = referred_to_model(run.residuals, applied[i][1], run.residuals.errors_of(y))
+        return whitened_error(run, evidence.noise, error, clip)
 
     with ThreadPoolExecutor(evidence.jobs) as threads:
         return list(threads.map(whitened, range(len(tried))))

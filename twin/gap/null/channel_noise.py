@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, sheet_correlation
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import Indices, sample_map
 from terrafusion.twin.gap.rollout.residuals import (
@@ -74,12 +74,9 @@ def _lags(runs: Sequence[RunResiduals]) -> dict[str, int]:
 
 
 def _sheet_correlation(runs: Sequence[RunResiduals], channel: str, lags: int) -> tuple[float, ...] | None:
-    for run in runs:
-        for observed in run.log.observed:
-            if observed.channel == channel and observed.correlation is not None:
-                share, time_s = observed.correlation
-                return gauss_markov(share, time_s, observed.slot_s, lags)
-    return None
+    """That of the first run whose channel has one."""
+    mine = (o for run in runs for o in run.log.observed if o.channel == channel)
+    return next((rho for o in mine if (rho := sheet_correlation(o, lags)) is not None), None)
 
 
 def _channel_noise(

@@ -11,8 +11,9 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
+from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import Soils, prepared, starting_model, with_common_channels
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
@@ -21,7 +22,6 @@ from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
 from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
-    RunResiduals,
     WhitenedRun,
     initial_state_sigma,
     whitened,
@@ -41,7 +41,6 @@ class GapEvidence:
         channels: observed channels.
         noise: of each channel.
         runs, references: whitened residuals of each.
-        residuals, reference_residuals: those of each before whitening.
         soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
         notes: assumptions, in sentences.
@@ -56,8 +55,6 @@ class GapEvidence:
     noise: dict[str, ResidualNoise]
     runs: list[WhitenedRun]
     references: list[WhitenedRun]
-    residuals: list[RunResiduals]
-    reference_residuals: list[RunResiduals]
     soil_limit: Array
     cache: LinearisationCache
     notes: tuple[str, ...]
@@ -84,8 +81,7 @@ def gather_evidence(
         TerrafusionError: the twin diverges on every reference.
     """
     jobs, R = jobs if is_thread_safe(candidates) else 1, len(runs)
-    model, soil, notes = starting_model([*runs, *references], vehicle, soils)
-    logs = with_common_channels(prepared([*runs, *references], model, soil, source))
+    logs, model, notes = prepared([*runs, *references], vehicle, soils, source)
     channels = tuple(o.channel for o in logs[0].observed)
     known = {} if cache is None else cache
     if references:
@@ -117,6 +113,6 @@ def gather_evidence(
     clipped = limit_outliers(white[:R], white[R:], first_sigma, jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
-        model, candidates, channels, noise, *clipped, every[:R], every[R:], limit, linearised,
+        model, candidates, channels, noise, *clipped, limit, linearised,
         tuple(dict.fromkeys(notes)), more, jobs,
     )  # fmt: skip

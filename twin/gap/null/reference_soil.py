@@ -49,6 +49,6 @@ def set_soil(
     """
     runs = all_residuals(logs[:RUNS], cache, channels, jobs)
     noise = learn_noise(runs, [], cache.candidates, jobs)
-    search, model = SoilSearch.of(runs, noise, *TOGETHER), cache.model
+    search, model = SoilSearch.of(runs, noise, TOGETHER), cache.model
     search_soil([search], cache, noise, jobs=jobs)
     return dataclasses.replace(model, effects={**model.effects, **with_run_soil(search.soil, cache, {})[0]})

@@ -15,7 +15,6 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.rollout.residuals import (
     OUTLIER_SIGMAS,
-    ROBUST_STEPS,
     WhitenedRun,
     clip_outliers,
     explained_by_states,
@@ -61,7 +60,7 @@ def _fit_states(run: WhitenedRun, sigma: Array) -> tuple[Array, Array]:
     """Gain (T, n) of the states, and the error (n,) that they do not explain."""
     J, e = run.by_state, run.error
     gain: Array = np.asarray(np.linalg.solve(run.state_information(sigma), J.T))
-    return gain, e - explained_by_states(J, gain, e, OUTLIER_SIGMAS, ROBUST_STEPS)
+    return gain, e - explained_by_states(J, gain, e)
 
 
 def _clipped(run: WhitenedRun, gain: Array, limit: Array) -> WhitenedRun:

@@ -77,6 +77,10 @@ class RunResiduals:
         none = [e[:, None][:, :0] for e in self.error]
         return dataclasses.replace(self, by_state=none, by_effect=none, by_nuisance=none)
 
+    def errors_of(self, predicted: Sequence[Array]) -> list[Array]:
+        """What was measured less other predictions, one array a channel."""
+        return [o.value - y for o, y in zip(self.log.observed, predicted, strict=True)]
+
     def stacked(self) -> list[Array]:
         """State, effect, nuisance, error and pose columns of each channel, side by side."""
         parts = zip(self.by_state, self.by_effect, self.by_nuisance, self.error, self.by_pose, strict=True)
@@ -88,19 +92,17 @@ class WhitenedRun:
     """One run, whitened, poses projected out.
 
     Attributes:
-        name: of the recording.
+        residuals: the run before whitening.
         gram: (T + P + 1, T + P + 1) inner products of [state, effect and nuisance, error].
         rows: (n, T + P + 1) those columns; `channel`, `time_s` and `window` (n,) of each sample.
         pose_basis: (n, 3) orthonormal columns in each window, spanned by the poses.
         patch_basis: (n, D) columns U in each window: 1 - U U' whitens patches of ground (see `patchiness`).
-        seconds: length.
         states: T.
         state_gain: (T, n) states by an error, as ridge regression has them; no rows where nothing is clipped.
         limit: by channel, where errors that the states do not explain are clipped (see `outliers`).
     """
 
-    name: str
-    log: PreparedLog
+    residuals: RunResiduals
     gram: Array
     rows: NDArray[np.float32]
     pose_basis: Array
@@ -108,10 +110,19 @@ class WhitenedRun:
     channel: Indices
     time_s: Array
     window: Indices
-    seconds: float
     states: int
     state_gain: Array
     limit: Array
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        return self.log.name
+
+    @property
+    def log(self) -> PreparedLog:
+        """Of the run."""
+        return self.residuals.log
 
     @property
     def error(self) -> Array:
@@ -342,8 +353,8 @@ def projected(run: RunResiduals, white: Array) -> WhitenedRun:
         own = columns[mine]
         out[mine] = own - Q @ (Q.T @ own)
     return WhitenedRun(
-        run.log.name, run.log, out.T @ out, out.astype(np.float32), pose_basis, pose_basis[:, :0], channel,
-        np.concatenate([middle[i][rows] for i, _, rows in blocks]), window, run.log.seconds(),
+        run, out.T @ out, out.astype(np.float32), pose_basis, pose_basis[:, :0], channel,
+        np.concatenate([middle[i][rows] for i, _, rows in blocks]), window,
         run.by_state[0].shape[1], np.zeros((0, len(window))), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
 
@@ -357,24 +368,20 @@ def _orthonormal(columns: Array) -> Array:
 
 
 def whitened_error(
-    run: RunResiduals,
-    white: WhitenedRun,
-    noise: Mapping[str, ResidualNoise],
-    error: Sequence[Array],
-    clip: bool = True,
+    run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Sequence[Array], clip: bool = True
 ) -> Array:
     """Another error of the run, one array a channel, whitened (n,), poses projected out, outliers clipped."""
-    out = white.without_poses(whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0])
-    out = white.without_patches(out)
-    return clip_outliers(white, out) if clip else out
+    out = run.without_poses(whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0])
+    out = run.without_patches(out)
+    return clip_outliers(run, out) if clip else out
 
 
-def explained_by_states(J: Array, gain: Array, error: Array, limit: float, steps: int) -> Array:
+def explained_by_states(J: Array, gain: Array, error: Array) -> Array:
     """Part (n,) of an error that a run's states explain, by their columns J (n, T) and `gain` (T, n); what is
-    beyond the limit does not pull on them (Huber 1964)."""
+    an outlier does not pull on them (Huber 1964)."""
     out = np.zeros(len(error))
-    for _ in range(steps):
-        out = J @ (gain @ (out + np.clip(error - out, -limit, limit)))
+    for _ in range(ROBUST_STEPS):
+        out = J @ (gain @ (out + np.clip(error - out, -OUTLIER_SIGMAS, OUTLIER_SIGMAS)))
     return out
 
 
@@ -382,6 +389,6 @@ def clip_outliers(run: WhitenedRun, error: Array) -> Array:
     """A whitened error (n,), clipped where the run's states do not explain it."""
     if not len(run.state_gain):
         return error
-    explained = explained_by_states(run.by_state, run.state_gain, error, OUTLIER_SIGMAS, ROBUST_STEPS)
+    explained = explained_by_states(run.by_state, run.state_gain, error)
     limit = run.limit[run.channel]
     return np.asarray(explained + np.clip(error - explained, -limit, limit))

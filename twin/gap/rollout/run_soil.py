@@ -44,15 +44,14 @@ class SoilSearch:
     """Search for the soil (S,) that runs share, in typical sizes from the model's.
 
     Attributes:
-        runs, white: before and after whitening, about the model's soil.
-        errors, white_errors: of each run on the soil found so far, before and after whitening.
+        runs: each about the model's soil.
+        errors, white_errors: of each on the soil found so far, before and after whitening.
         soil_sigma, effect_sigma: 1 sigma of a step of the soil, and of the effects beside it.
         share: of a full step.
         going: whether another step is tried.
     """
 
-    runs: Sequence[RunResiduals]
-    white: Sequence[WhitenedRun]
+    runs: Sequence[WhitenedRun]
     soil: Array
     errors: Sequence[Sequence[Array]]
     white_errors: Sequence[Array]
@@ -63,13 +62,11 @@ class SoilSearch:
 
     @classmethod
     def of(
-        cls, runs: Sequence[RunResiduals], noise: Mapping[str, ResidualNoise], soil_sigma: float,
-        effect_sigma: float,
-    ) -> Self:  # fmt: skip
-        """From the model's soil on."""
+        cls, runs: Sequence[RunResiduals], noise: Mapping[str, ResidualNoise], sigmas: tuple[float, float]
+    ) -> Self:
+        """From the model's soil on; `sigmas` of a step and of the effects."""
         white = [whitened(run.without_nuisance(), noise) for run in runs]
-        errors = [run.error for run in runs]
-        return cls(runs, white, runs[0].soil, errors, [w.error for w in white], soil_sigma, effect_sigma)
+        return cls(white, runs[0].soil, [run.error for run in runs], [w.error for w in white], *sigmas)
 
     def cost(self) -> float:
         """Square of the whitened errors."""
@@ -77,13 +74,13 @@ class SoilSearch:
 
     def step(self, candidates: Candidates) -> Array:
         """Step (S,) of the soil; effects and the sensor states of each run take part as nuisances."""
-        S, T, K = len(self.soil), self.white[0].states, len(candidates.keys)
+        S, T, K = len(self.soil), self.runs[0].states, len(candidates.keys)
         others = [T + k for k in range(K) if k not in soil_columns(candidates)]
         mine, states = np.array([*range(S), *others]), np.arange(S, T)
         sigma = np.repeat([self.soil_sigma, self.effect_sigma], [S, len(others)])
         H, gradient = np.diag(sigma**-2.0), np.zeros(len(mine))
-        for white, error in zip(self.white, self.white_errors, strict=True):
-            G, gain = white.gram, white.rows[:, :-1].astype(float).T @ error
+        for run, error in zip(self.runs, self.white_errors, strict=True):
+            G, gain = run.gram, run.rows[:, :-1].astype(float).T @ error
             cross = G[np.ix_(states, mine)]
             both = np.column_stack([cross, gain[states]])
             own = np.linalg.solve(G[np.ix_(states, states)] + np.eye(T - S), both)
@@ -97,9 +94,8 @@ class SoilSearch:
         """Goes to a soil where its predictions are better, one array a channel of each run."""
         known = [values for values in predicted if values is not None]
         if len(known) == len(self.runs):
-            errors = [errors_of(run, values) for run, values in zip(self.runs, known, strict=True)]
-            parts = zip(self.runs, self.white, errors, strict=True)
-            white = [whitened_error(run, w, noise, error) for run, w, error in parts]
+            errors = [r.residuals.errors_of(values) for r, values in zip(self.runs, known, strict=True)]
+            white = [whitened_error(run, noise, e) for run, e in zip(self.runs, errors, strict=True)]
             now, before = sum(float(e @ e) for e in white), self.cost()
             if now < before:
                 self.soil, self.errors, self.white_errors = soil, errors, white
@@ -150,7 +146,7 @@ def at_run_soil(
 ) -> list[RunResiduals]:
     """Runs with errors linearised about their own soil; `limit` as for `search_soil`."""
     with ThreadPoolExecutor(jobs) as threads:
-        searches = list(threads.map(lambda run: SoilSearch.of([run], noise, *ALONE), runs))
+        searches = list(threads.map(lambda run: SoilSearch.of([run], noise, ALONE), runs))
     search_soil(searches, cache, noise, limit, jobs)
     return [
         dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.errors[0]))
@@ -161,11 +157,6 @@ def at_run_soil(
 def referred_to_model(run: RunResiduals, soil: Array, errors: Sequence[Array]) -> list[Array]:
     """Errors on the run's soil (S,) as they would be on the model's, to first order."""
     return [e + s[:, : len(soil)] @ soil for e, s in zip(errors, run.by_state, strict=True)]
-
-
-def errors_of(run: RunResiduals, predicted: Sequence[Array]) -> list[Array]:
-    """What a run measured less predictions, one array a channel."""
-    return [o.value - y for o, y in zip(run.log.observed, predicted, strict=True)]
 
 
 def with_run_soil(

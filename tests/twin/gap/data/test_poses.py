@@ -11,7 +11,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned_start, alignment_angles, moved
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -27,8 +27,8 @@ def recording() -> Recording:
 
 
 def log_of(recording: Recording) -> tuple[PreparedLog, Model]:
-    model, ground, _ = starting_model([recording], load_vehicle("elevate"), None)
-    return prepared([recording], model, ground, "auto")[0], model
+    (log,), model, _ = prepared([recording], load_vehicle("elevate"), None)
+    return log, model
 
 
 def turned(log: PreparedLog, angle: float, shift: float) -> list[np.ndarray]:

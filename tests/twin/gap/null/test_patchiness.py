@@ -10,7 +10,7 @@ import pytest
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null import evidence as gathering
@@ -36,8 +36,7 @@ SIGMA = initial_state_sigma(CANDIDATES)
 
 @pytest.fixture(scope="module")
 def residuals() -> RunResiduals:
-    model, ground, _ = starting_model([run(1)], load_vehicle("elevate"), None)
-    (log,) = prepared([run(1)], model, ground, "auto")
+    (log,), model, _ = prepared([run(1)], load_vehicle("elevate"), None)
     return run_residuals(log, LinearisationCache(model, CANDIDATES), [o.channel for o in log.observed])
 
 

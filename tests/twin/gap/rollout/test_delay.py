@@ -8,7 +8,7 @@ import pytest
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.rollout.delay import CLOCK_DRIFT, DELAYS, IMU, delayed_samples, without_delays
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, predictions
@@ -20,8 +20,8 @@ CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
 
 @pytest.fixture(scope="module")
 def log_and_model() -> tuple[PreparedLog, Model]:
-    model, ground, _ = starting_model([run(1)], load_vehicle("elevate"), None)
-    return prepared([run(1)], model, ground, "auto")[0], model
+    (log,), model, _ = prepared([run(1)], load_vehicle("elevate"), None)
+    return log, model
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import coarse_counts
 from terrafusion.twin.gap.rollout.ground_patches import LENGTH_M, PATCH_SIGMAS, STEP_M
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation, linearise
@@ -24,8 +24,7 @@ SHEAR = "soil_strength/shear"
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[PreparedLog, Linearisation]:
-    model, ground, _ = starting_model([run(1)], load_vehicle("elevate"), None)
-    (log,) = prepared([run(1)], model, ground, "auto")
+    (log,), model, _ = prepared([run(1)], load_vehicle("elevate"), None)
     return log, linearise(log, model, CANDIDATES, log.start, {*PATCH_SIGMAS, DRIFT})
 
 

@@ -10,7 +10,7 @@ import pytest
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, clip_outliers
+from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, RunResiduals, WhitenedRun, clip_outliers
 from terrafusion.twin.gap.rollout.run_soil import SoilSearch, soil_limit
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs
@@ -25,12 +25,17 @@ def evidence() -> GapEvidence:
     return gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
 
 
+def residuals(runs: list[WhitenedRun]) -> list[RunResiduals]:
+    return [run.residuals for run in runs]
+
+
 def test_a_run_looks_for_its_ground_where_the_references_are(evidence: GapEvidence) -> None:
     """A gap is not taken up as ground before anything else is asked; references stay near each other."""
-    assert len(evidence.residuals[0].soil) == len(SOIL_SIGMAS)
-    assert all(np.abs(run.soil[0]) < 2.0 for run in evidence.residuals)  # .9 is 4.5 typical sizes
-    wide = [dataclasses.replace(evidence.residuals[0], soil=np.array([3.0, 0.0, 0.0]))] * 9
-    near = [dataclasses.replace(evidence.residuals[0], soil=np.zeros(3))] * 9
+    first = evidence.runs[0].residuals
+    assert len(first.soil) == len(SOIL_SIGMAS)
+    assert all(np.abs(run.soil[0]) < 2.0 for run in residuals(evidence.runs))  # .9 is 4.5 typical sizes
+    wide = [dataclasses.replace(first, soil=np.array([3.0, 0.0, 0.0]))] * 9
+    near = [dataclasses.replace(first, soil=np.zeros(3))] * 9
     assert soil_limit(wide, evidence.candidates)[0] == 4.0
     assert soil_limit(near, evidence.candidates)[0] < 0.6
 
@@ -45,8 +50,8 @@ def test_a_search_that_steps_too_far_tries_a_shorter_step_and_is_the_same_for_ju
     found = gather_evidence(
         runs(990, 1), runs(990, 3), load_vehicle("elevate"), None, evidence.candidates, jobs=2
     )
-    assert all(run.soil.any() for run in found.reference_residuals[:2])
-    np.testing.assert_array_equal(found.residuals[0].soil, found.reference_residuals[0].soil)
+    assert all(run.soil.any() for run in residuals(found.references[:2]))
+    np.testing.assert_array_equal(*(run.soil for run in residuals([found.runs[0], found.references[0]])))
 
 
 def test_a_ground_beyond_its_range_is_neither_driven_nor_carried_back(evidence: GapEvidence) -> None:
@@ -61,7 +66,7 @@ def test_a_ground_beyond_its_range_is_neither_driven_nor_carried_back(evidence: 
     assert none is not None
     np.testing.assert_array_equal(none, same)
     assert np.abs(none - other).max() > 0.1
-    assert all(r.soil[k] >= 0.0 for r in evidence.residuals)
+    assert all(r.soil[k] >= 0.0 for r in residuals(evidence.runs))
 
 
 def test_limits_move_with_what_the_states_explain(evidence: GapEvidence) -> None:

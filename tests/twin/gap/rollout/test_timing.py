@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals, whitened, with_timing
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -27,8 +27,7 @@ def between_samples(by_s: float) -> Recording:
 
 def test_wheel_errors_at_unlogged_steps_stay_within_their_sigma() -> None:
     references, judged = [run(1), run(2)], between_samples(0.5 / 30.0)
-    model, soil, _ = starting_model([*references, judged], load_vehicle("elevate"), "loose_sand")
-    logs = prepared([*references, judged], model, soil, "auto")
+    logs, model, _ = prepared([*references, judged], load_vehicle("elevate"), "loose_sand")
     channels = tuple(o.channel for o in logs[0].observed)
     residuals = [run_residuals(log, LinearisationCache(model, CANDIDATES), channels) for log in logs]
     noise = learn_noise(residuals[:2], residuals[2:], CANDIDATES)
@@ -48,8 +47,7 @@ def test_wheel_errors_at_unlogged_steps_stay_within_their_sigma() -> None:
 
 
 def test_only_changes_of_the_input_within_a_window_count() -> None:
-    model, soil, _ = starting_model([run(1)], load_vehicle("elevate"), "loose_sand")
-    log = prepared([run(1)], model, soil, "auto")[0]
+    (log,), _, _ = prepared([run(1)], load_vehicle("elevate"), "loose_sand")
     assert log.input_step_s > 0.0
     steady = with_timing(log, [np.zeros(len(o.value)) for o in log.observed])
     assert all(o.timing is not None and not o.timing.any() for o in steady.observed)
