@@ -91,7 +91,7 @@ def prepare(
         observed = tuple(o for o in observed if o.channel.startswith(channels))
     ends = [float(o.end_s[-1]) for o in observed]
     end_s = min(given.end_s(), max(ends, default=0.0))
-    windows = _windows(_begin_s(given.sides, model.slope_rad), end_s, window_s)
+    windows = split_windows(_begin_s(given.sides, model.slope_rad), end_s, window_s)
     named = [o.channel for o in observed]
     within = (_within(o, windows, given.gaps) for o in observed)
     observed = tuple(o for o in within if len(o.value) >= LEAST_ROWS)
@@ -135,7 +135,7 @@ def grounds(recording: Recording, start_ns: int) -> tuple[tuple[str, ...], Array
     return (str(label[0]), *(str(x) for x in label[change])), np.asarray(middle)
 
 
-def _windows(begin_s: float, end_s: float, window_s: float) -> NDArray[np.int64]:
+def split_windows(begin_s: float, end_s: float, window_s: float) -> NDArray[np.int64]:
     """First and last grid sample (W, 2) of the windows; a remainder of half the length is one, too."""
     first, last, size = round(begin_s / DT_S), int(end_s / DT_S + 1e-6), max(2, round(window_s / DT_S))
     edges = np.arange(first, max(last, first) + 1, size)

@@ -18,11 +18,11 @@ from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import (
     BY_HAND,
-    DRIVES,
     LIFTED,
     PAYLOAD,
     Planner,
     _forecast,
+    drives,
 )
 from terrafusion.twin.gap.answer.verdict import UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
@@ -96,7 +96,7 @@ def test_ambiguous_larger_wheels_and_grousers(wide: GapDiagnosis) -> None:
         calibration_head().law_motion * number["value"] <= number["sigma"] < 0.02
     )  # the robot's law may be another
     following = answer["next_run"]
-    assert following["scenario"] in (*DRIVES, BY_HAND)  # only a tape measure tells some of them apart
+    assert following["scenario"] in (*drives(), BY_HAND)  # only a tape measure tells some of them apart
     assert set(following["separates"]) < set(answer["causes"][0]["class"])
 
 
@@ -297,7 +297,7 @@ def test_a_payload_tells_what_scales_with_the_load(wide: GapDiagnosis) -> None:
     before, plain, loaded = _separations(wide, *pair, "", name, name + PAYLOAD)
     assert before <= plain
     assert loaded > 1.5 * plain
-    assert "four headings" in DRIVES
+    assert "four headings" in drives()
 
 
 def test_the_gap_shrinks_on_runs_left_out(wide: GapDiagnosis) -> None:

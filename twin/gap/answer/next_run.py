@@ -4,19 +4,21 @@ judged runs together. Together, since the size of an effect is the same in both:
 the load and one that does not differ as soon as the load changes."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib import resources
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.log import PreparedLog, split_windows
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.effects.terrain import FORMS as GROUND_FORMS
@@ -28,9 +30,10 @@ from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
-from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop
-from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
+from terrafusion.twin.scenario.file import scenario_of
+from terrafusion.twin.scenario.scenario import Scenario
 
 BY_HAND = "measurement by hand"
 SEPARABLE_SIGMAS = 3.0  # sigmas by which a drive must distinguish two effects
@@ -40,34 +43,13 @@ PAYLOAD = ", with payload"
 PAYLOAD_SHARE = 0.25  # of the robot's mass, at its centre of gravity
 GROUND = frozenset(form.effect for form in GROUND_FORMS)
 STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothing
-HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
 
 
-def _sequence(*segments: tuple[float, float, float]) -> tuple[DriveSegment, ...]:
-    return tuple(DriveSegment(*s) for s in ((1.0, 0.0, 0.0), *segments, (1.0, 0.0, 0.0)))
-
-
-_SPINS = _sequence((7.0, 0.0, 0.8), (7.0, 0.0, -0.8), (1.0, 0.0, 0.0), (7.0, 1.2, 0.0), (6.0, 0.6, 0.0))
-_STAIRS = _sequence(*((5.0, v, 0.0) for v in (0.3, 0.6, 0.9, 1.2, 1.5)))
-DRIVES: dict[str, tuple[DriveSegment, ...]] = {
-    "same lane both ways": _sequence(
-        (9.0, 1.0, 0.0), (1.0, 0.0, 0.0), (HALF_TURN_S, 0.0, 0.6), (1.0, 0.0, 0.0), (9.0, 1.0, 0.0)
-    ),
-    "spins, then straight": _SPINS,
-    "spins, then straight" + PAYLOAD: _SPINS,
-    "four headings": _sequence(*(((4.5, 0.8, 0.0), (QUARTER_TURN_S, 0.0, 0.6)) * 4)),
-    LIFTED: _sequence((6.0, 0.4, 0.0), (6.0, 0.8, 0.0), (6.0, 1.4, 0.0), (5.0, -0.6, 0.0), (5.0, 0.0, 0.8)),
-    "chirp, 0.2 to 3 Hz": (
-        DriveSegment(2.0),
-        DriveSegment(13.0, v_mps=0.8, v_amplitude_mps=0.3, period_s=5.0, end_period_s=1.0 / 3.0),
-        DriveSegment(2.0),
-        DriveSegment(13.0, v_mps=0.8, yaw_rate_amplitude_radps=0.5, period_s=5.0, end_period_s=1.0 / 3.0),
-    ),
-    "speed staircase": _STAIRS,
-    "speed staircase" + PAYLOAD: _STAIRS,
-    "figure of eight": _sequence((14.0, 0.8, 0.45), (14.0, 0.8, -0.45)),
-}
-"""Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
+@functools.cache
+def drives() -> dict[str, Scenario]:
+    """Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
+    with resources.as_file(resources.files("terrafusion.twin.gap.answer") / "next_drives.yaml") as path:
+        return {name: scenario_of({"drive": d}, str(path), name) for name, d in read_yaml(path).items()}
 
 
 @dataclass(frozen=True)
@@ -111,9 +93,8 @@ class Planner:
         """The drive on which two causes differ most; a direct measurement where none separates them."""
         effects = {one.effect, other.effect}
         with ThreadPoolExecutor(self.evidence.jobs) as threads:
-            found = dict(
-                zip(DRIVES, threads.map(lambda name: self.forecast(name, effects), DRIVES), strict=True)
-            )
+            information = threads.map(lambda name: self.forecast(name, effects), drives())
+            found = dict(zip(drives(), information, strict=True))
 
         def sigmas(name: str, repeats: int = 1) -> float:
             return self.separation(one, other, repeats * found[name])
@@ -132,7 +113,7 @@ class Planner:
         mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
         load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
         why = (
-            f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
+            f"of {len(drives())} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
             f"{sigmas(best):.1f} sigma with these runs at the size found; {often} should do{load}"
         )
         return NextRun(best, pair, sigmas(best), why)
@@ -181,17 +162,16 @@ def _explained(information: Array, signal: Array, columns: Sequence[int]) -> flo
 
 def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRun:
     """Sensitivities of a drive that has not been driven: its errors are zero."""
-    template, model, segments = evidence.runs[0].log, evidence.model, DRIVES[name]
+    template, model, scenario = evidence.runs[0].log, evidence.model, drives()[name]
     label = template.labels[0]
     if name == LIFTED:
         model = _lifted(model, label)
     elif PAYLOAD in name:
         model = _with_mass(model, (1.0 + PAYLOAD_SHARE) * model.vehicle.body.mass_kg)
-    scenario = Scenario(name, sum(s.duration_s for s in segments), drive=segments)
     t_s = DT_S * np.arange(round(scenario.duration_s / DT_S) + 1.0)
     prompt = dataclasses.replace(model.vehicle.drive, dead_time_s=0.0)  # the log's commands have none either
     _, inputs = open_loop(scenario, t_s, dataclasses.replace(model.vehicle, drive=prompt))
-    windows = _windows(len(t_s))
+    windows = split_windows(0.0, scenario.duration_s, WINDOW_S)
     end = float(windows[-1, 1]) * DT_S
     log = PreparedLog(
         name, inputs[:, :2], template.follows, (label,), np.zeros(0), windows,
@@ -206,32 +186,17 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
 
 
 def _lifted(model: Model, label: str) -> Model:
-    """The twin with its wheels in the air: the stand carries the body, so that the wheels have no load."""
-    model = _with_mass(model, STAND_MASS_KG)
-    return dataclasses.replace(model, soils={**model.soils, label: _no_ground()})
+    """The twin with its wheels in the air: the stand carries the body, so that the wheels have neither load
+    nor friction."""
+    firm = load_soil("asphalt")
+    shear = dataclasses.replace(firm.shear, friction_angle_rad=1e-6, friction_cap=1e-6)
+    air = dataclasses.replace(firm, shear=shear, resistance=dataclasses.replace(firm.resistance, rolling=0.0))
+    return dataclasses.replace(_with_mass(model, STAND_MASS_KG), soils={**model.soils, label: air})
 
 
 def _with_mass(model: Model, mass_kg: float) -> Model:
     body = dataclasses.replace(model.vehicle.body, mass_kg=mass_kg)
     return dataclasses.replace(model, vehicle=dataclasses.replace(model.vehicle, body=body))
-
-
-def _no_ground() -> SoilParams:
-    """Contact of lifted wheels: no friction."""
-    firm = load_soil("asphalt")
-    return dataclasses.replace(
-        firm,
-        shear=dataclasses.replace(firm.shear, friction_angle_rad=1e-6, friction_cap=1e-6),
-        resistance=dataclasses.replace(firm.resistance, rolling=0.0),
-    )
-
-
-def _windows(count: int) -> NDArray[np.int64]:
-    """Windows (W, 2) of so many grid samples, without a last one of less than half the length."""
-    size = round(WINDOW_S / DT_S)
-    edges = np.append(np.arange(0, count - 1, size), count - 1)
-    windows = np.stack([edges[:-1], edges[1:]], axis=1)
-    return windows[windows[:, 1] - windows[:, 0] >= size // 2]
 
 
 def _empty(observed: Observed, end_s: float) -> Observed:
