@@ -18,10 +18,11 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.poses import aligned_start
-from terrafusion.twin.gap.data.samples import sample_map
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
 from terrafusion.twin.model.vehicle import VehicleParams
 
@@ -45,41 +46,29 @@ class LeastSquaresAnswer:
 class _Fit:
     """Residuals of logs and their derivatives by all parameters x (P,), in typical sizes."""
 
-    def __init__(self, model: Model, candidates: Candidates) -> None:
-        self.model, self.candidates = model, candidates
+    def __init__(self, model: Model, candidates: Candidates, channels: Sequence[str]) -> None:
+        self.model, self.candidates, self.channels = model, candidates, channels
         self.keys, self.scale = candidates.keys, candidates.scale
         self.low, self.high = candidates.bounds(range(len(self.keys)))
-        self.sigma: dict[str, float] = {}  # of a channel's residual, in that of its data sheet
+        self.noise = dict.fromkeys(channels, ResidualNoise(1.0))  # white, in that of the data sheets
 
-    def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> tuple[Array, Array]:
-        """Residual (n,) and its derivatives (n, P), the pose at each window's start projected out."""
+    def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> WhitenedRun:
+        """A log against the twin with parameters x, the pose at each window's start projected out."""
         effects = dict(zip(self.keys, (x * self.scale).tolist(), strict=True))
         model = dataclasses.replace(self.model, effects=effects)
         run = linearise(log, model, self.candidates, log.start, None if derivatives else ())
         found = channel_sensitivities(log, run)
         found = moved_to(log, found, log.start, aligned_start(log, [s.value for s in found], log.start))
-        parts, windows = [], []
-        for i, window, rows in sample_map(log).blocks:
-            observed, s = log.observed[i], found[i]
-            sigma = observed.sigma[rows, None] * self.sigma.get(observed.channel, 1.0)
-            error = (observed.value[rows] - s.value[rows])[:, None]
-            parts.append(np.hstack([error, -s.by_effect[rows], s.by_pose[rows]]) / sigma)
-            windows.append(np.full(len(rows), window))
-        whole, window_of_row = np.concatenate(parts), np.concatenate(windows)
-        for window in np.unique(window_of_row):
-            mine = window_of_row == window
-            Q, sizes, _ = np.linalg.svd(whole[mine, -3:], full_matrices=False)
-            Q = Q[:, sizes > 1e-6 * max(float(sizes[0]), 1e-12)]
-            whole[mine] -= Q @ (Q.T @ whole[mine])
-        return whole[:, 0], whole[:, 1:-3]
+        raw = residuals_from(log, found, model, self.candidates, self.channels)
+        return whitened(raw.without_nuisance(), self.noise)
 
     def calibrated(self, logs: Sequence[PreparedLog]) -> Array:
-        """Parameters (P,) of the logs together; sets each channel's sigma to the residual they leave."""
+        """Parameters (P,) of the logs together; sets each channel's noise to the residual they leave."""
         x = self.one_step(np.zeros(len(self.keys)), logs)
-        left = [(self.of(log, x, False)[0], sample_map(log).blocks) for log in logs]
-        for i, observed in enumerate(logs[0].observed):
-            own = [e[np.concatenate([np.full(len(r), k) for k, _, r in blocks]) == i] for e, blocks in left]
-            self.sigma[observed.channel] = max(float(np.sqrt(np.mean(np.concatenate(own) ** 2))), LEAST_SIGMA)
+        left = [self.of(log, x, False) for log in logs]
+        for i, channel in enumerate(self.channels):
+            error = np.concatenate([run.error[run.channel == i] for run in left])
+            self.noise[channel] = ResidualNoise(max(float(np.sqrt(np.mean(error**2))), LEAST_SIGMA))
         return x
 
     def one_step(self, x: Array, logs: Sequence[PreparedLog]) -> Array:
@@ -107,17 +96,17 @@ class _Fit:
         return x, information
 
     def _cost(self, x: Array, logs: Sequence[PreparedLog]) -> float:
-        squares = sum(float(np.sum(self.of(log, x, False)[0] ** 2)) for log in logs)
+        squares = sum(float(self.of(log, x, False).gram[-1, -1]) for log in logs)
         return squares + float(np.sum((x / PRIOR) ** 2))
 
     def _step(self, x: Array, logs: Sequence[PreparedLog]) -> tuple[Array, Array]:
         from scipy.optimize import lsq_linear
 
-        parts = [self.of(log, x) for log in logs]
-        information = sum((J.T @ J for _, J in parts), np.eye(len(x)) / PRIOR**2)
+        runs = [self.of(log, x) for log in logs]
+        gram = sum((run.gram[run.states :, run.states :] for run in runs), np.zeros((len(x) + 1,) * 2))
+        information, explained = gram[:-1, :-1] + np.eye(len(x)) / PRIOR**2, gram[:-1, -1] - x / PRIOR**2
         factor = np.linalg.cholesky(information).T
-        gradient = sum((J.T @ e for e, J in parts), x / PRIOR**2)
-        goal = factor @ x - np.linalg.solve(factor.T, gradient)
+        goal = factor @ x + np.linalg.solve(factor.T, explained)
         return np.asarray(lsq_linear(factor, goal, (self.low, self.high)).x), information
 
 
@@ -148,8 +137,9 @@ def joint_least_squares(
         raise DataError(f"{len(references)} references", remedy=f"give at least {FEWEST_REFERENCES}")
     candidates = first_forms(Candidates.of())
     logs, model, _ = prepared([*runs, *references], vehicle, None)
+    logs = [dataclasses.replace(log, input_step_s=0.0) for log in logs]  # commands at the times logged
     judged, normal = logs[: len(runs)], logs[len(runs) :]
-    fit = _Fit(model, candidates)
+    fit = _Fit(model, candidates, [o.channel for o in logs[0].observed])
     base = fit.calibrated(normal[:CALIBRATION_RUNS])
     single = np.array([fit.one_step(base, [log]) for log in normal])
     x, information = fit.minimum(base, judged)
