@@ -15,7 +15,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import TANGENT, Variant
 from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
-from terrafusion.twin.engine.native import MAX_BLOCKS, Driver
+from terrafusion.twin.engine.native import MAX_BLOCKS
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
@@ -84,34 +84,13 @@ def integrate_with_sensitivity(
     tangents = _tangents(plant, directions, effects)
     fixed = plant.route.is_fixed()
     native = chosen(backend, Variant(TANGENT, effects, fixed, _active(tangents, fixed)))
+    nx, count = len(STATES), directions.count
     if native is None:
-        return _by_vm(x0, inputs, dt_s, plant, t0_s, steps, every, tangents, effects)
-    return _by_c(native, x0, inputs, dt_s, plant, t0_s, steps, every, tangents)
-
-
-def _active(tangents: tuple[Array, ...], fixed_ground: bool) -> frozenset[tuple[str, int]]:
-    """The parameters that change along some direction; all of the soil on ground that changes."""
-    _, vehicle, effects, table = (a.any(axis=1) for a in tangents)
-    soil = table.reshape(-1, len(SOIL_PARAMETERS)).any(axis=0) | (not fixed_ground)
-    named = {"vehicle": vehicle, "effects": effects, "soil": soil}
-    return frozenset((name, int(i)) for name, some in named.items() for i in np.flatnonzero(some))
-
-
-def _by_c(
-    native: Driver,
-    x0: Array,
-    inputs: Array,
-    dt_s: float,
-    plant: Plant,
-    t0_s: float,
-    steps: int,
-    every: int,
-    tangents: tuple[Array, ...],
-) -> tuple[Array, Array]:
-    """As many directions at a time as the driver carries."""
-    count, together = tangents[0].shape[1], native.lanes * MAX_BLOCKS
-    states = np.empty(((len(inputs) - 1) // every + 1, len(STATES)))
-    parts = []
+        out = vm.run_with_tangents(x0, inputs, dt_s, plant, t0_s, steps, tangents, effects)[::every]
+        raise_if_diverged(out, t0_s, every * dt_s)
+        return out[:, :nx], out[:, nx:].reshape(len(out), count, nx).transpose(0, 2, 1)
+    states, parts = np.empty(((len(inputs) - 1) // every + 1, nx)), list[Array]()
+    together = native.lanes * MAX_BLOCKS  # as many directions at a time as the driver carries
     for first in range(0, max(count, 1), together):
         some = [a[:, first : first + together] for a in tangents]
         missing = -some[0].shape[1] % native.lanes
@@ -124,21 +103,12 @@ def _by_c(
     return states, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
 
 
-def _by_vm(
-    x0: Array,
-    inputs: Array,
-    dt_s: float,
-    plant: Plant,
-    t0_s: float,
-    steps: int,
-    every: int,
-    tangents: tuple[Array, ...],
-    effects: tuple[str, ...],
-) -> tuple[Array, Array]:
-    out = vm.run_with_tangents(x0, inputs, dt_s, plant, t0_s, steps, tangents, effects)[::every]
-    raise_if_diverged(out, t0_s, every * dt_s)
-    nx, count = len(STATES), tangents[0].shape[1]
-    return out[:, :nx], out[:, nx:].reshape(len(out), count, nx).transpose(0, 2, 1)
+def _active(tangents: tuple[Array, ...], fixed_ground: bool) -> frozenset[tuple[str, int]]:
+    """The parameters that change along some direction; all of the soil on ground that changes."""
+    _, vehicle, effects, table = (a.any(axis=1) for a in tangents)
+    soil = table.reshape(-1, len(SOIL_PARAMETERS)).any(axis=0) | (not fixed_ground)
+    named = {"vehicle": vehicle, "effects": effects, "soil": soil}
+    return frozenset((name, int(i)) for name, some in named.items() for i in np.flatnonzero(some))
 
 
 def _tangents(plant: Plant, d: Directions, effects: tuple[str, ...]) -> tuple[Array, ...]:

@@ -95,35 +95,33 @@ def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int,
 
 def gap_map(evidence: GapEvidence, sigma: Array, robot: RobotOffsets, seed: int) -> list[GapCell]:
     """All cells with enough samples, most important first; none with fewer than `LEAST_REFERENCES`."""
-    runs, count_runs = [*evidence.runs, *evidence.references], len(evidence.runs)
+    runs, R = [*evidence.runs, *evidence.references], len(evidence.runs)
     if len(evidence.references) < LEAST_REFERENCES:
         return []
     errors = [without_states(run, sigma, own_error(run, robot)) for run in runs]
-    table = [cells(run, evidence.model, e) for run, e in zip(runs, errors, strict=True)]
+    by_run = [cells(run, evidence.model, e) for run, e in zip(runs, errors, strict=True)]
     keys = [
-        k for k in table[0] if all(k in t for t in table) and min(t[k][1] for t in table[:count_runs]) >= 1.0
-    ]
-    keys = [k for k in keys if sum(t[k][1] for t in table) >= LEAST_SAMPLES]
+        key for key in by_run[0]
+        if all(key in found for found in by_run) and min(found[key][1] for found in by_run[:R]) >= 1.0
+        and sum(found[key][1] for found in by_run) >= LEAST_SAMPLES
+    ]  # fmt: skip
     if not keys:
         return []
-    square = np.array([[t[k][0] for k in keys] for t in table])
-    count = np.array([[t[k][1] for k in keys] for t in table])
-    own = np.arange(count_runs)
-    excess = _excess(square, count, own)
+    square, count, _ = np.array([[found[key] for key in keys] for found in by_run]).transpose(2, 0, 1)
+    excess = _excess(square, count, np.arange(R))
     tops = [
-        float(_excess(square, count, np.asarray(choice)).max())
-        for choice in permutations(len(runs), count_runs, seed)
+        float(_excess(square, count, np.asarray(choice)).max()) for choice in permutations(len(runs), R, seed)
     ]
-    floor = square[count_runs:].sum(axis=0) / np.maximum(count[count_runs:].sum(axis=0), 1e-9)
-    over = np.maximum(square[own].sum(axis=0) - floor * count[own].sum(axis=0), 0.0)
-    share = over / max(float(over.sum()), 1e-12)
-    sigmas = np.sqrt(square[own].sum(axis=0) / np.maximum(count[own].sum(axis=0), 1e-9))
+    own, size = square[:R].sum(axis=0), count[:R].sum(axis=0)
+    floor = square[R:].sum(axis=0) / np.maximum(count[R:].sum(axis=0), 1e-9)
+    over = np.maximum(own - floor * size, 0.0)
+    share, sigmas = over / max(float(over.sum()), 1e-12), np.sqrt(own / np.maximum(size, 1e-9))
     physical = [physical_error(run, evidence.noise, e) for run, e in zip(runs, errors, strict=True)]
-    table = [cells(run, evidence.model, e) for run, e in zip(runs, physical, strict=True)]
-    sums = np.array([[t[k] for k in keys] for t in table])
+    by_run = [cells(run, evidence.model, e) for run, e in zip(runs, physical, strict=True)]
+    sums = np.array([[found[key] for key in keys] for found in by_run])
     judged, normal = (
         np.sqrt(some[:, :, 0].sum(axis=0) / np.maximum(some[:, :, 2].sum(axis=0), 1.0))
-        for some in (sums[:count_runs], sums[count_runs:])
+        for some in (sums[:R], sums[R:])
     )
     found = [
         GapCell(

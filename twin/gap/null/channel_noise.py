@@ -88,23 +88,12 @@ def _channel_noise(
     rho = _sheet_correlation(every, channel, lags)
     if rho is None:
         rho = autoregressive([(s, clipped(v)) for s, v in series], lags)
-    white = _whitened_series(ResidualNoise(1.0, rho), series)
+    plain = ResidualNoise(1.0, rho)
+    white = np.concatenate([plain.whiten(s, np.ones(len(s)), v[:, None])[:, 0] for s, v in series])
     robust = 1.4826 * float(np.median(np.abs(white)))
     return ResidualNoise(
         max(float(np.sqrt(np.mean(np.minimum(white**2, (4.0 * robust) ** 2)))), LEAST_SCALE), rho
     )
-
-
-def _whitened_series(noise: ResidualNoise, series: Series) -> Array:
-    """All residuals, white; windows with equally spaced samples are whitened together."""
-    groups: dict[bytes, Series] = {}
-    for slots, values in series:
-        groups.setdefault(np.diff(slots).tobytes(), []).append((slots, values))
-    parts = [
-        noise.whiten(some[0][0], np.ones(len(some[0][0])), np.column_stack([v for _, v in some])).ravel()
-        for some in groups.values()
-    ]
-    return np.concatenate(parts)
 
 
 def _fit_residuals(
