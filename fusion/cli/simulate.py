@@ -47,7 +47,7 @@ def simulate(
     """Simulate one drive with its ground truth, and write it as a log folder or an MCAP bag.
 
     Built-in scenarios: paper_profile, straight, circle, figure_eight, spin, staircase, chirp, waypoints,
-    mixed_terrain, demo. A YAML file may also set zones of GNSS outage and of trees; see
+    mixed_terrain, field_sand, demo. A YAML file may also set zones of GNSS outage and of trees; see
     docs/reference/sensors.md.
 
     Examples:

@@ -13,44 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
-from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study.cases import UNEVEN
 from terrafusion.twin.study.published import VEHICLE
 
-FIELD_DRIVE = Scenario(
-    name="field_sand",
-    duration_s=240.0,
-    description="a wander over sand under partial canopy (assumed; the study's field test is not described)",
-    drive=(
-        DriveSegment(4.0),
-        DriveSegment(40.0, v_mps=1.0, v_amplitude_mps=0.3, yaw_rate_amplitude_radps=0.2, period_s=20.0),
-        DriveSegment(12.0, v_mps=0.9, yaw_rate_radps=0.2),
-        DriveSegment(30.0, v_mps=1.3, v_amplitude_mps=0.7, period_s=15.0),
-        DriveSegment(6.0),
-        DriveSegment(14.0, v_mps=0.8, yaw_rate_radps=-0.25),
-        DriveSegment(40.0, v_mps=1.0, v_amplitude_mps=0.5, yaw_rate_amplitude_radps=0.15, period_s=10.0),
-        DriveSegment(4.0),
-        DriveSegment(14.0, v_mps=0.9, yaw_rate_radps=0.3),
-        DriveSegment(36.0, v_mps=1.2, v_amplitude_mps=0.7, period_s=12.0),
-        DriveSegment(36.0, v_mps=0.9, v_amplitude_mps=0.3, yaw_rate_amplitude_radps=0.2, period_s=9.0),
-        DriveSegment(4.0),
-    ),
-    route=(
-        RouteLeg("medium_sand", 40.0), RouteLeg("loose_sand", 50.0), RouteLeg("medium_sand", 30.0),
-        RouteLeg("loose_sand", 40.0), RouteLeg("medium_sand"),
-    ),
-    variation=UNEVEN,
-    gnss_fix=Fix.SINGLE,
-    canopy=(
-        Canopy(Interval(30.0, 40.0), 0.3), Canopy(Interval(95.0, 25.0), 0.3),
-        Canopy(Interval(165.0, 45.0), 0.3),
-    ),
-)  # fmt: skip
+SCENARIO = "field_sand"
 HIGH_HZ = 2.0  # above this the robot's own speed profile holds nothing: what is faster is vibration and shock
 
 
@@ -78,8 +47,8 @@ class FieldDrive:
 
 
 def drive_field(seed: int) -> FieldDrive:
-    """One run of `FIELD_DRIVE`, as the receiver and the IMU report it."""
-    return field_drive_of(simulate(FIELD_DRIVE, vehicle=VEHICLE, seed=seed))
+    """One run of the scenario `field_sand`, as the receiver and the IMU report it."""
+    return field_drive_of(simulate(SCENARIO, vehicle=VEHICLE, seed=seed))
 
 
 def field_drive_of(recording: Recording) -> FieldDrive:
