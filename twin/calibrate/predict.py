@@ -109,11 +109,8 @@ def _follow(vehicle: Array, d: Directions) -> None:
 def route_of(log: PreparedLog, model: Model) -> RouteTable:
     """The ground over the log's time."""
     vectors = np.array([soil_vector(model.soils[label]) for label in log.labels])
-    if len(log.labels) == 1:
-        return RouteTable("time", np.zeros(1), vectors)
-    half = 0.5 * min(TRANSITION_S, 0.8 * float(np.min(np.diff(log.borders), initial=TRANSITION_S)))
-    at = np.repeat(log.borders, 2) + np.tile([-half, half], len(log.borders))
-    return RouteTable("time", at, np.repeat(vectors, 2, axis=0)[1:-1])
+    transition_s = min(TRANSITION_S, 0.8 * float(np.min(np.diff(log.borders), initial=TRANSITION_S)))
+    return RouteTable.joined("time", vectors, log.borders, transition_s)
 
 
 def _knot_labels(log: PreparedLog) -> list[str]:

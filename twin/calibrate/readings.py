@@ -24,7 +24,7 @@ from terrafusion.twin.model.measurement import (
     measurement_jacobian,
 )
 from terrafusion.twin.model.motion import plane_rotation
-from terrafusion.twin.model.plant import Plant, RouteTable, smoothstep
+from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS
 
@@ -58,9 +58,9 @@ def readings(
         inputs: (N, U).
     """
     effects = {name: plant.effects.get(name, 0.0) for name in plant.effect_names(directions.effects)}
-    soil = np.tile(along(plant.route, plant.route.soil, t_s), (1, len(WHEELS)))
+    soil = np.tile(plant.route.along(plant.route.soil, t_s), (1, len(WHEELS)))
     y, by = _measured(states, inputs, plant.vehicle, soil, mounting_vector(model.vehicle), effects)
-    d_soil = np.tile(along(plant.route, directions.soil, t_s), (1, len(WHEELS), 1))
+    d_soil = np.tile(plant.route.along(directions.soil, t_s), (1, len(WHEELS), 1))
     d_effects = [directions.effects.get(name, np.zeros(directions.count)) for name in sorted(effects)]
     dy = by.states @ changes + by.vehicle @ directions.vehicle + by.soil @ d_soil
     if effects:
@@ -85,16 +85,6 @@ def _measured(
 @functools.cache
 def _compiled(effects: tuple[str, ...]) -> tuple[Pointwise | None, Pointwise | None]:
     return pointwise(measurement(effects)), pointwise(measurement_jacobian(effects))
-
-
-def along(route: RouteTable, table: Array, t_s: Array) -> Array:
-    """Rows of a route's `table` (K, ...) at times (N,), joined as the engine joins them."""
-    out = np.repeat(table[:1], len(t_s), axis=0)
-    for k in range(len(route.at) - 1):
-        s = np.clip((t_s - route.at[k]) / (route.at[k + 1] - route.at[k]), 0.0, 1.0)
-        share = smoothstep(s)
-        out += share.reshape(-1, *(1,) * (table.ndim - 1)) * (table[k + 1] - table[k])
-    return out
 
 
 def _channels(

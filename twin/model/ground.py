@@ -15,7 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
-from terrafusion.twin.model.plant import RouteTable, SoilField, smoothstep
+from terrafusion.twin.model.plant import RouteTable, SoilField
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 CELLS_A_LENGTH = 5.0
@@ -159,7 +159,7 @@ def under_wheels(route: RouteTable, vehicle: Array, t_s: Array, states: Array) -
     wheels = []
     for end, side in zip(ENDS, SIDES, strict=True):
         ahead, left = end * half["wheelbase"], side * half["track"]
-        soil = _on_route(route, time_weight * t_s + travel_weight * (travel + ahead))
+        soil = route.along(route.soil, time_weight * t_s + travel_weight * (travel + ahead))
         if route.field is not None:
             place = x + np.cos(yaw) * ahead - np.sin(yaw) * left, y + np.sin(yaw) * ahead + np.cos(yaw) * left
             gain = value_at(route.field.log_gain, route.field.cell_m, *place)
@@ -168,13 +168,3 @@ def under_wheels(route: RouteTable, vehicle: Array, t_s: Array, states: Array) -
             soil = soil + share * (route.field.patch_soil - soil)
         wheels.append(soil)
     return np.hstack(wheels)
-
-
-def _on_route(route: RouteTable, coordinate: Array) -> Array:
-    """Soil (N, S) of the route's table at coordinates (N,)."""
-    if len(route.at) == 1:
-        return np.tile(route.soil[0], (len(coordinate), 1))
-    i = np.clip(np.searchsorted(route.at, coordinate, side="right") - 1, 0, len(route.at) - 2)
-    w = np.clip((coordinate - route.at[i]) / (route.at[i + 1] - route.at[i]), 0.0, 1.0)
-    w = smoothstep(w)[:, None]
-    return np.asarray(route.soil[i] + w * (route.soil[i + 1] - route.soil[i]))

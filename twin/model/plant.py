@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -47,6 +47,25 @@ class RouteTable:
     at: Array
     soil: Array
     field: SoilField | None = None
+
+    @classmethod
+    def joined(
+        cls, coordinate: str, soils: Array, borders: Array, transition: float, field: SoilField | None = None
+    ) -> Self:
+        """Soils (K, S) with borders (K - 1,) between them, each crossed within `transition`."""
+        if len(soils) == 1:
+            return cls(coordinate, np.zeros(1), soils, field)
+        at = np.repeat(borders, 2) + np.tile([-0.5 * transition, 0.5 * transition], len(borders))
+        return cls(coordinate, at, np.repeat(soils, 2, axis=0)[1:-1], field)
+
+    def along(self, table: Array, coordinate: Array) -> Array:
+        """Rows of a table (K, ...) of the knots at coordinates (N,), joined as the engine joins them."""
+        out = np.repeat(table[:1], len(coordinate), axis=0)
+        for k in range(len(self.at) - 1):
+            s = np.clip((coordinate - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0)
+            share = smoothstep(s).reshape(-1, *(1,) * (table.ndim - 1))
+            out += share * (table[k + 1] - table[k])
+        return out
 
     def weights(self) -> tuple[float, float]:
         """Factors of time and travel that make the coordinate."""

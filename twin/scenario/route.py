@@ -66,11 +66,7 @@ class Route:
         vectors = np.array([soil_vector(soil) for soil in self.soils])
         patch = None if self.patch_soil is None else soil_vector(self.patch_soil)
         field = soil_field(self.variation, self.patches, patch, seed)
-        if len(self.soils) == 1:
-            return RouteTable(self.coordinate, np.zeros(1), vectors, field)
-        half = 0.5 * self.transition
-        at = np.repeat(self.borders, 2) + np.tile([-half, half], len(self.borders))
-        return RouteTable(self.coordinate, at, np.repeat(vectors, 2, axis=0)[1:-1], field)
+        return RouteTable.joined(self.coordinate, vectors, self.borders, self.transition, field)
 
     def along(self, t_s: Array, travel_m: Array) -> Array:
         """The route's coordinate (N,) at times and distances driven (N,)."""

@@ -7,6 +7,7 @@ the references spent at least a second in it, or as long as the judged runs.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,7 +28,8 @@ MOSTLY_COVERED = 0.8
 """Share of the judged time from which the drives do not limit the answer."""
 
 Cell = tuple[int, int, int]
-Seconds = dict[Cell, float]
+Samples = Counter[Cell]
+"""Number of samples, `DT_S` apart, by cell of commanded speed, turn rate and acceleration."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +44,14 @@ class DriveCoverage:
         return self.covered < MOSTLY_COVERED
 
 
-def time_by_cell(twist: Array) -> Seconds:
-    """Seconds by cell of commanded speed, turn rate and acceleration; `twist` is (N, 2), m/s and rad/s."""
+def by_cell(twist: Array) -> Samples:
+    """Samples of a commanded twist (N, 2), m/s and rad/s."""
     columns = np.column_stack([twist, commanded_acceleration(twist[:, 0])])
     index = np.round(columns / [SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2]).astype(np.int64)
     low, sides = index.min(axis=0), tuple((np.ptp(index, axis=0) + 1).tolist())
     number, count = np.unique(np.ravel_multi_index(tuple((index - low).T), sides), return_counts=True)
     cells = (np.stack(np.unravel_index(number, sides), axis=1) + low).tolist()
-    return {(a, b, c): DT_S * n for (a, b, c), n in zip(cells, count.tolist(), strict=True)}
+    return Counter({(a, b, c): n for (a, b, c), n in zip(cells, count.tolist(), strict=True)})
 
 
 def drive_coverage(
@@ -66,45 +68,36 @@ def drive_coverage(
 
 def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverage:
     """Coverage of commanded twists (N, 2) each, by those of references."""
-    known, judged = (_summed([time_by_cell(twist) for twist in some]) for some in (references, runs))
-    total = sum(judged.values())
-    lacking = {c: s for c, s in judged.items() if known.get(c, 0.0) < min(LEAST_S, s)}
-    words = dict[str, float]()
-    for cell, seconds in lacking.items():
-        name = _words(cell)
-        words[name] = words.get(name, 0.0) + seconds
+    known, judged = (sum(map(by_cell, some), Samples()) for some in (references, runs))
+    lacking = {cell: n for cell, n in judged.items() if known[cell] < min(LEAST_S / DT_S, n)}
+    words = Counter[str]()
+    for cell, n in lacking.items():
+        words[_words(cell)] += n
     order = sorted(words, key=lambda name: (-words[name], name))
-    listed = [f"{name} ({words[name]:.0f} s)" for name in order if words[name] >= LEAST_MISSING * total]
-    return DriveCoverage(1.0 - sum(lacking.values()) / max(total, 1e-9), tuple(listed[:MOST_LISTED]))
+    listed = [
+        f"{name} ({DT_S * words[name]:.0f} s)"
+        for name in order
+        if words[name] >= LEAST_MISSING * judged.total()
+    ]
+    return DriveCoverage(1.0 - words.total() / max(judged.total(), 1), tuple(listed[:MOST_LISTED]))
 
 
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     """Share of the commands, by time, that runs and references have in common, over that of as many of the
     references with the rest, at most one; twists as for `coverage`."""
-    size, known = min(len(runs), len(references) // 2), [time_by_cell(twist) for twist in references]
+    size, known = min(len(runs), len(references) // 2), [by_cell(twist) for twist in references]
     if not size:
         return 1.0
     own = [
         _in_common(known[i : i + size], [*known[:i], *known[i + size :]])
         for i in range(0, len(known) - size + 1, size)
     ]
-    return min(
-        _in_common([time_by_cell(twist) for twist in runs], known) / max(float(np.mean(own)), 1e-9), 1.0
-    )
+    return min(_in_common([by_cell(twist) for twist in runs], known) / max(float(np.mean(own)), 1e-9), 1.0)
 
 
-def _in_common(runs: Sequence[Seconds], others: Sequence[Seconds]) -> float:
-    a, b = _summed(runs), _summed(others)
-    total, of_others = sum(a.values()), sum(b.values())
-    return sum(min(seconds / total, b.get(cell, 0.0) / of_others) for cell, seconds in a.items())
-
-
-def _summed(parts: Sequence[Seconds]) -> Seconds:
-    out = Seconds()
-    for part in parts:
-        for cell, seconds in part.items():
-            out[cell] = out.get(cell, 0.0) + seconds
-    return out
+def _in_common(runs: Sequence[Samples], others: Sequence[Samples]) -> float:
+    a, b = sum(runs, Samples()), sum(others, Samples())
+    return sum(min(n / a.total(), b[cell] / b.total()) for cell, n in a.items())
 
 
 def _words(cell: Cell) -> str:

@@ -17,7 +17,6 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.predict import LEAD_S, POSE, plant_of, run_up
-from terrafusion.twin.calibrate.readings import along
 from terrafusion.twin.engine import codegen
 from terrafusion.twin.engine.codegen import LANES, LANES_32, Variant
 from terrafusion.twin.engine.integrate import compiled
@@ -200,7 +199,7 @@ class SampledSensors:
         self.mounting = mounting_vector(model.vehicle)
         route = plant_of(log, dataclasses.replace(model, effects={}), [])[0].route
         self.fixed = route.is_fixed()
-        self.soil = route.soil[0] if self.fixed else along(route, route.soil, samples.astype(float) * DT_S)
+        self.soil = route.soil[0] if self.fixed else route.along(route.soil, samples.astype(float) * DT_S)
         self._inputs: dict[int, tuple[Array, Array]] = {}
 
     def read(
