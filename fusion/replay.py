@@ -16,6 +16,7 @@ from terrafusion.fusion.estimate.estimate import Estimate, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, with_usable_samples
 from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.estimator.imu_level import ImuLevel
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
@@ -223,8 +224,12 @@ def _run_estimator(
     batch: bool,
     progress: Callable[[float], None] | None,
     watch: Callable[[Estimator], None] | None,
+    level: ImuLevel | None = None,
 ) -> _FinishedRun:
-    """Feed the samples as live; for a batch, then smooth the whole run."""
+    """Feed the samples as live; for a batch, then smooth the whole run.
+
+    A batch in which the IMU proves tilted begins again with its samples levelled, by `level`.
+    """
     config = drive.config
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
 
@@ -239,8 +244,13 @@ def _run_estimator(
         on_innovation=history.innovations.append,
         archive=archive,
     )
+    if level is not None:
+        estimator.learned.mounting.level.hold(level.known, level.corrects)
     started = time.perf_counter()
     latencies_ms = feed(estimator, drive.given, progress)
+    found = estimator.learned.mounting.level
+    if batch and level is None and any(found.corrects):
+        return _run_estimator(drive, batch, None, watch, found)
     alignment_notes = history.align(estimator.gnss.alignment, batch)
     if archive is not None and history.states:
         history.smooth(archive, estimator.config, estimator.gnss.alignment is not None)

@@ -31,6 +31,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig, sensor_config_of, yaw_factor
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, with_usable_samples
+from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.library import is_named
@@ -63,6 +64,11 @@ class LearnedNumber:
     gained_nats: float
 
     @property
+    def level(self) -> bool:
+        """Whether it is a tilt of zero, and was."""
+        return self.value == self.value_before == 0.0
+
+    @property
     def observed(self) -> bool:
         """Whether the logs determine it."""
         return self.gained_nats >= OBSERVED_NATS
@@ -76,7 +82,7 @@ class SensorCalibration:
         vehicle: as it was known before, with the geometry `overrides` that the logs report.
         extends: its name or file.
         logs: names of the logs used.
-        numbers: by their names in `ROWS`, and `imu_yaw_rad`; the antenna as its place in the body frame.
+        numbers: by their names in `ROWS`, and the IMU's angles; the antenna as its place in the body frame.
         notes: what was left out or assumed.
     """
 
@@ -92,8 +98,13 @@ class SensorCalibration:
         return [name for name, number in self.numbers.items() if not number.observed]
 
     def known(self) -> SensorNumbers:
-        """The numbers and how they are known: those that were not observed as before."""
-        known = {name: self._known(name) for name in self.numbers if not name.startswith("antenna")}
+        """The numbers and how they are known: those that were not observed as before.
+
+        A level IMU needs no entry.
+        """
+        level = {name for name in LEVEL if name in self.numbers and self.numbers[name].level}
+        names = [name for name in self.numbers if not name.startswith("antenna") and name not in level]
+        known = {name: self._known(name) for name in names}
         return dataclasses.replace(self.vehicle.robot, antenna_m=self._antenna(), **known)
 
     def _known(self, name: str) -> KnownNumber:
@@ -162,19 +173,22 @@ def calibrate_sensors(
     learners = [(log, learner) for log, learner in ready if learner is not None]
     yaw = _one_source_of_yaw(learners)
     earlier: _Learner | None = None
-    before, mounted_before = learners[0][1].known, learners[0][1].mounting.known
+    before, first = learners[0][1].known, learners[0][1].mounting
+    mounted_before = {"imu_yaw_rad": first.known, **dict(zip(LEVEL, first.level.known, strict=True))}
     for i, (log, learner) in enumerate(learners):
         with errors_of(log.name):
             share = None if progress is None else _part_of(progress, i, len(learners))
             learner.run(earlier, share)
             # What was learned with a wrong angle of the IMU is learned again with the right one.
-            earlier = learner.again(earlier, params) if learner.mounting.corrects else learner
+            earlier = learner.again(earlier, params) if learner.turned else learner
     last = earlier or learners[-1][1]
     logs = tuple(log.name for log, _ in learners)
     extends = vehicle.name if isinstance(vehicle, VehicleParams) else str(vehicle or _named(recordings[0]))
     numbers = _numbers(before, last.known, params, yaw)
     if last.mounting.learns:
-        numbers["imu_yaw_rad"] = _mounting(mounted_before, last.mounting.known)
+        known = (*last.mounting.level.known, last.mounting.known)
+        for name, angle in zip((*LEVEL, "imu_yaw_rad"), known, strict=True):
+            numbers[name] = _mounting(mounted_before[name], angle)
     return SensorCalibration(params, extends, overrides, logs, numbers, notes)
 
 
@@ -218,27 +232,34 @@ class _Learner:
     def mounting(self) -> ImuMounting:
         return self.estimator.learned.mounting
 
+    @property
+    def turned(self) -> bool:
+        """Whether the IMU proved turned or tilted."""
+        return self.mounting.corrects or any(self.mounting.level.corrects)
+
     def run(
         self,
         earlier: "_Learner | None",
         progress: Callable[[float], None] | None,
-        mounted: Angle | None = None,
+        mounted: ImuMounting | None = None,
     ) -> None:
-        """Learn from the log, beginning with what the learner of an earlier one knows, or with an angle."""
+        """Learn from the log, beginning with what the learner of an earlier one knows, with the angles of the
+        IMU by that or by `mounted`.
+        """
         if earlier is not None:
             known = for_the_next_run(earlier.known, self.calibration.prior, self.yaw)
             self.estimator.learned.start_from(known)
-            self.mounting.start_from(earlier.mounting.known)
+            self.mounting.start_as(earlier.mounting)
         if mounted is not None:
-            self.mounting.start_from(mounted)
+            self.mounting.start_as(mounted)
         feed(self.estimator, self.given, progress)
 
     def again(self, earlier: "_Learner | None", params: VehicleParams) -> "_Learner":
-        """A learner that takes the same log with the angle of the IMU that this one found."""
-        angle, again = self.mounting.known, _started(self.given, self.estimator.config.inputs, params)
+        """A learner that takes the same log with the angles of the IMU that this one found."""
+        again = _started(self.given, self.estimator.config.inputs, params)
         assert again is not None
-        again.run(earlier, None, angle)
-        again.mounting.start_from(angle)  # the log shows it once
+        again.run(earlier, None, self.mounting)
+        again.mounting.start_as(self.mounting)  # the log shows it once
         return again
 
 

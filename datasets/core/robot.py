@@ -137,7 +137,7 @@ class SensorNumbers:
         wheel_scale: true distance over that of the wheels, less one; usual slip included.
         gnss_delay_s, wheel_delay_s: lateness of the stamps against those of the IMU.
         imu_roll_rad, imu_pitch_rad, imu_yaw_rad: angles at which the IMU is mounted: readings turned about x,
-            then y, then z by them are in body axes. The first two are not learned while driving.
+            then y, then z by them are in body axes.
     """
 
     antenna_m: Place | None = None

@@ -1,19 +1,19 @@
 """An IMU turned about its vertical axis: learned while the wheels roll, corrected where it is clear.
 
-One that is tilted is turned by the angles of the vehicle file.
+Its tilt is that of `imu_level`.
 """
 
 from __future__ import annotations
 
 import math
 
-import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, LEAST_SIGMA_RAD, Angle, MountingAngle
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.imu_level import ImuLevel
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
@@ -25,12 +25,6 @@ accelerations hides; it ends at half of both (assumed)."""
 
 DOUBTFUL_TILT_RAD, DOUBTFUL_MPS = 0.1, 0.3
 """1 sigma of tilt and speed after driving with turned accelerations (assumed)."""
-
-
-def level_rotation(known: SensorNumbers) -> Array | None:
-    """Rotation (3, 3) of the readings of a tilted IMU into body axes, but for yaw; None for a level one."""
-    roll, pitch = (0.0 if one is None else one.number for one in (known.imu_roll_rad, known.imu_pitch_rad))
-    return None if roll == pitch == 0.0 else np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix())
 
 
 class ImuMounting:
@@ -48,8 +42,8 @@ class ImuMounting:
         spec = config.rig.sensors.imu
         self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
         self.corrects_since_ns: int | None = None
+        self.level = ImuLevel(config, imu)
         self.start_from(_prior(config.rig.known.imu_yaw_rad))
-        imu.level = level_rotation(config.rig.known) if config.inputs.imu == "six_axis" else None
 
     @property
     def corrects(self) -> bool:
@@ -60,6 +54,11 @@ class ImuMounting:
         """Begin with what is known of the robot."""
         self.before = self.known = before
         self._imu.mounting_rad = before.rad
+
+    def start_as(self, other: ImuMounting) -> None:
+        """Begin with all angles as another one has them by now."""
+        self.start_from(other.known)
+        self.level.start_from(other.level.known)
 
     def keyframe(
         self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
@@ -72,19 +71,22 @@ class ImuMounting:
             return False
         if rolled_m is None or (friction is not None and friction.leads):
             self._seen.interrupt()
+            self.level.interrupt()
             return False
+        levelled = self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
         bias = chain.state(chain.last).bias
         turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
         raw = turned(accel_mps2, -self._imu.mounting_rad) if self._imu.mounting_rad else accel_mps2
         if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
-            return False
+            return levelled
         was_rad = self._imu.mounting_rad
         seen = self._seen.angle
         found = seen.as_mounted() if self.before.sigma_rad == ANY_ANGLE_RAD else self.before.combined(seen)
         self.known = self._in_use(found, chain.nodes[-1].t_ns)
         self._imu.mounting_rad = self.known.rad
         if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
-            return False
+            return levelled
+        self.level.restart()
         self._skid.restart()
         chain.restart(self._doubt(chain.dim, bias.vector()))
         return True

@@ -30,6 +30,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
@@ -121,6 +122,7 @@ class LearnedNumbers:
         """A fix as it came."""
         if self.calibration is not None:
             self.calibration.fix(fix.t_ns, fix.enu_m, fix.horizontal_sigma_m)
+        self.mounting.level.fix(fix, self._gnss.scale)
 
     def keyframe(
         self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
@@ -177,6 +179,11 @@ class LearnedNumbers:
             angle, before = self.mounting.known, self.mounting.before
             sigmas = angle.sigma_rad, before.sigma_rad
             numbers.append(NumberAfterDrive("imu_yaw_rad", angle.rad, *sigmas, self.mounting.corrects))
+            level = self.mounting.level
+            for name, now, was, corrects in zip(
+                LEVEL, level.known, level.before, level.corrects, strict=True
+            ):
+                numbers.append(NumberAfterDrive(name, now.rad, now.sigma_rad, was.sigma_rad, corrects))
         return tuple(numbers)
 
     def corrections(self) -> Corrections:

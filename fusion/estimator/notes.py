@@ -34,6 +34,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot slid, with a friction limit of {friction.mps2:.1f} m/s2")
+    if level := estimator.learned.mounting.level.note():
+        notes.append(level)
     if estimator.imu.spikes:
         notes.append(
             f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "

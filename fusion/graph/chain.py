@@ -225,9 +225,16 @@ class Chain:
             for symbol, _ in SYMBOLS.values():
                 self.values.erase(symbol(k))
 
-    def restart(self, extra_variance: Array, k: int | None = None, anew: Sequence[int] = ()) -> None:
+    def restart(
+        self,
+        extra_variance: Array,
+        k: int | None = None,
+        anew: Sequence[int] = (),
+        at: KeyState | None = None,
+    ) -> None:
         """Drop all before keyframe k (by default the newest); its marginal stays as prior, with
-        `extra_variance` (dim,) added. Of the states `anew` only that variance stays.
+        `extra_variance` (dim,) added. Of the states `anew` only that variance stays. The newest may go on
+        from another state, `at`.
 
         For an estimate that has proved wrong: what comes next may move it freely, and does not bend the
         past.
@@ -243,7 +250,7 @@ class Chain:
         root = np.linalg.inv(np.linalg.cholesky(marginal + np.diag(extra_variance)))
         # Keyframes that follow keep their linearisation, so keyframe k must keep its own, too.
         shift = mean if k == self.last else np.zeros(self.dim)
-        point, empty = node.point.retract(shift), gtsam.NonlinearFactorGraph()
+        point, empty = at or node.point.retract(shift), gtsam.NonlinearFactorGraph()
         fresh = self._node(point, node.t_ns, empty, None, None, node.gyro_radps, node.accel_mps2, False)
         fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
         self._erase(self.first, k)

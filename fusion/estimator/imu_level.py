@@ -1,0 +1,191 @@
+"""A tilted IMU: roll and pitch of its mounting, learned from turns and heights, corrected where clear."""
+
+from __future__ import annotations
+
+import cmath
+import dataclasses
+import math
+
+import gtsam
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
+from terrafusion.fusion.calibration.mounting import Angle
+from terrafusion.fusion.calibration.tilt import LEAST_SIGMA_RAD, MountingTilt
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
+from terrafusion.fusion.inputs.door import GnssFix
+from terrafusion.fusion.inputs.streams import ImuStream
+
+LEVEL = ("imu_roll_rad", "imu_pitch_rad")
+"""The two angles by their names in the vehicle file."""
+ASSUMED_SIGMA_RAD = 0.1
+"""1 sigma of the tilt of an IMU of which nothing is known (assumed)."""
+CLEAR_SIGMA, LEAST_RAD, STILL_CLEAR = 4.0, math.radians(1.5), 0.5
+"""A correction begins at so many sigma from what was known and no less than this angle, and ends at half of
+both (assumed)."""
+LEAST_STEP_RAD = math.radians(0.5)
+"""What is in use changes by no less."""
+DOUBTFUL_RAD, DOUBTFUL_CLIMB_MPS = 0.02, 0.1
+"""1 sigma of the body's tilt and of its climb after a correction (assumed)."""
+UP_OVER_LEVEL = 1.5
+"""Least sigma of a height over that of its place (assumed: geometry of satellites)."""
+
+
+def level_rotation(roll_rad: float, pitch_rad: float) -> Array | None:
+    """Rotation (3, 3) of the readings of a tilted IMU into body axes, but for yaw; None for a level one."""
+    if roll_rad == pitch_rad == 0.0:
+        return None
+    return np.asarray(gtsam.Rot3.RzRyRx(roll_rad, pitch_rad, 0.0).matrix())
+
+
+class ImuLevel:
+    """Learns roll and pitch of the IMU, and levels its samples.
+
+    Attributes:
+        before: roll and pitch as known before the drive; known: now, as they are used.
+        corrects: which of both the drive corrects.
+    """
+
+    def __init__(self, config: EstimatorConfig, imu: ImuStream) -> None:
+        self._imu, self._seen, self._new = imu, MountingTilt(), False
+        spec = config.rig.sensors.imu
+        self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
+        self._six_axis = config.inputs.imu == "six_axis"
+        self.start_from(_priors(config.rig.known))
+
+    def start_from(self, before: tuple[Angle, Angle]) -> None:
+        """Begin with what is known of the robot."""
+        self.before = self.known = before
+        self.corrects, self._held = [False, False], False
+        self._back: Array | None = None
+        self._level()
+
+    def _level(self) -> None:
+        roll, pitch = (angle.rad for angle in self.known)
+        self._imu.level = level_rotation(roll, pitch) if self._six_axis else None
+
+    def hold(self, known: tuple[Angle, Angle], corrects: list[bool]) -> None:
+        """Use what an earlier pass over the same samples gave, and learn no more of them."""
+        self.known, self.corrects, self._held = known, corrects, True
+        self._level()
+
+    def note(self) -> str | None:
+        """That samples are levelled, in a sentence."""
+        if not any(self.corrects):
+            return None
+        roll, pitch = (math.degrees(angle.rad) for angle in self.known)
+        return (
+            f"the IMU is tilted, roll {roll:.1f} and pitch {pitch:.1f} deg: its samples were levelled; "
+            "`terrafusion calibrate LOG --sensors` writes it to a vehicle file"
+        )
+
+    def restart(self) -> None:
+        """The axes were others than thought: begin to learn anew."""
+        self._seen = MountingTilt()
+
+    def interrupt(self) -> None:
+        """Motion is missing."""
+        self._seen.interrupt()
+
+    def fix(self, fix: GnssFix, scale: float) -> None:
+        """A fix as it came; its sigma counts `scale` times."""
+        sigma_m = max(float(fix.sigma_m[2]), UP_OVER_LEVEL * fix.horizontal_sigma_m) * scale
+        if math.isfinite(float(fix.enu_m[2]) + sigma_m):
+            self._new |= self._seen.height(float(fix.enu_m[2]), sigma_m)
+
+    def keyframe(
+        self, chain: Chain, dt_s: float, rolled_m: float, gyro_radps: Array, accel_mps2: Array
+    ) -> bool:
+        """Take the motion over `dt_s` up to the newest keyframe; True when states were turned.
+
+        Args:
+            rolled_m: mean distance of the wheels.
+            gyro_radps, accel_mps2: (3,) mean readings, corrected.
+        """
+        if self._held:
+            return False
+        state = chain.state(chain.last)
+        if self._back is not None:
+            gyro_radps, accel_mps2 = self._back @ gyro_radps, self._back @ accel_mps2
+        self._new |= self._seen.add(dt_s, rolled_m * state.rolling / dt_s, gyro_radps, accel_mps2)
+        if not self._new:
+            return False
+        self._new, yaw = False, self._imu.mounting_rad
+        was, used = complex(*self._angles()), []
+        for i, (before, off) in enumerate(zip(self.before, self._found(yaw), strict=True)):
+            found = before.combined(Angle(before.rad + off.rad, off.sigma_rad))
+            used.append(self._in_use(i, before, found))
+        self.known = used[0], used[1]
+        if abs(complex(*self._angles()) - was) < LEAST_STEP_RAD:
+            return False
+        self._turn(chain, yaw, abs(complex(*self._angles()) - was))
+        return True
+
+    def _angles(self) -> tuple[float, float]:
+        roll, pitch = self.known
+        return roll.rad, pitch.rad
+
+    def _found(self, yaw_rad: float) -> tuple[Angle, Angle]:
+        """Roll and pitch beyond those known before, by the axes in which the file has them."""
+        roll, pitch = self._seen.angles()
+        off = complex(roll.rad, pitch.rad) * cmath.exp(-1j * yaw_rad)
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        sigmas = (math.hypot(c * a.sigma_rad, s * b.sigma_rad) for a, b in ((roll, pitch), (pitch, roll)))
+        return Angle(off.real, next(sigmas)), Angle(off.imag, next(sigmas))
+
+    def _in_use(self, i: int, before: Angle, found: Angle) -> Angle:
+        """What was found where that is clear, else what was known before, its sigma with the difference."""
+        off = abs(found.rad - before.rad)
+        limit = max(CLEAR_SIGMA * found.sigma_rad, LEAST_RAD)
+        self.corrects[i] = off > (STILL_CLEAR * limit if self.corrects[i] else limit)
+        if self.corrects[i]:
+            return found
+        return Angle(before.rad, min(math.hypot(off, found.sigma_rad), before.sigma_rad))
+
+    def _turn(self, chain: Chain, yaw_rad: float, step_rad: float) -> None:
+        """Level the samples anew, and turn the newest state with them.
+
+        Its attitude becomes what the accelerometer says without a bias ahead or to the side, as heights may
+        have made one of the tilt; heading, place and velocity stay. The height is in doubt by `step_rad` of
+        the distance driven.
+        """
+        was = self._imu.level
+        self._level()
+        about = gtsam.Rot3.Rz(yaw_rad).matrix()
+        first, old, new = (
+            np.eye(3) if level is None else level
+            for level in (level_rotation(*(angle.rad for angle in self.before)), was, self._imu.level)
+        )
+        self._back = about @ first @ new.T @ about.T
+        turned = about @ new @ old.T @ about.T
+        state = chain.state(chain.last)
+        up = state.rotation[2]
+        force = turned @ (GRAVITY_MPS2 * up + state.bias.accelerometer())
+        now = force / np.linalg.norm(force)
+        attitude = state.pose.rotation().compose(gtsam.Rot3.Expmap(-np.cross(up, now)))
+        bias = turned @ state.bias.accelerometer()
+        point = dataclasses.replace(
+            state,
+            pose=gtsam.Pose3(attitude, state.pose.translation()),
+            bias=gtsam.imuBias.ConstantBias(now * (bias @ now), turned @ state.bias.gyroscope()),
+        )
+        doubt = np.zeros(chain.dim)
+        doubt[:2], doubt[VELOCITY.stop - 1] = DOUBTFUL_RAD**2, DOUBTFUL_CLIMB_MPS**2
+        doubt[5], doubt[BIAS] = (step_rad * self._seen.driven_m) ** 2, self._bias_sigma**2
+        chain.restart(doubt, at=point)
+
+
+def _priors(known: SensorNumbers) -> tuple[Angle, Angle]:
+    roll, pitch = (_prior(number) for number in (known.imu_roll_rad, known.imu_pitch_rad))
+    return roll, pitch
+
+
+def _prior(known: KnownNumber | None) -> Angle:
+    if known is None:
+        return Angle(0.0, ASSUMED_SIGMA_RAD)
+    sigma = known.sigma if isinstance(known.sigma, float) else ASSUMED_SIGMA_RAD
+    return Angle(known.number, max(sigma, LEAST_SIGMA_RAD))
