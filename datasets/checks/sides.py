@@ -76,14 +76,15 @@ def radius_difference(context: CheckContext) -> BootstrapInterval | None:
         return None
     gyro, apart, bias = known["gyro"], known["wheels"], _rest_bias(context)
     both = motion.agreement(gyro, apart)
-    rolled = _rolled(context)
+    driven = motion.wheel_speed(context)
     if (
         both is None
         or both.r < LEAST_R
-        or rolled is None
+        or driven is None
         or (bias is not None and abs(bias) > MOST_BIAS_RADPS)
     ):
         return None
+    rolled = motion.Integral(driven[0], motion.cumulative(*driven))  # mean of both sides, as `yaw_angles`
     start, end = motion.common_span(gyro, apart)
     grid = np.arange(start, end, WINDOW_S)
     columns = np.stack([rolled.rates(grid), gyro.rates(grid), np.ones(len(grid) - 1)], axis=1)
@@ -113,12 +114,6 @@ def _rest_bias(context: CheckContext) -> float | None:
         return None
     values = imu.gyro_radps[resting, 2]
     return float(np.nanmean(values)) if np.isfinite(values).any() else None
-
-
-def _rolled(context: CheckContext) -> motion.Integral | None:
-    """Distance rolled as the mean of both sides, in the unit of `yaw_angles`."""
-    driven = motion.wheel_speed(context)
-    return None if driven is None else motion.Integral(driven[0], motion.cumulative(*driven))
 
 
 def _scaled(wheels: Wheels, side: str, factor: float) -> Wheels:

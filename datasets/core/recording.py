@@ -9,6 +9,7 @@ import dataclasses
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from terrafusion.datasets.core.display import CLOCK_COLUMNS, clock_line, clock_rows, table_html
@@ -139,7 +140,7 @@ class Recording:
         order = [name for name in self.CHANNELS if name not in ("wheels", "imu")] + ["wheels", "imu"]
         channels = self.channels()
         streams = [channels[name].samples() for name in order if name in channels]
-        return heapq.merge(*streams, key=_time_of)
+        return heapq.merge(*streams, key=itemgetter(0))
 
     def to_pandas(self) -> dict[str, pd.DataFrame]:
         """A table for each channel that is present, and "truth", indexed by `t_ns`.
@@ -162,7 +163,3 @@ class Recording:
     def with_notes(self, *notes: str) -> Recording:
         """The same recording with further notes."""
         return dataclasses.replace(self, notes=(*self.notes, *notes))
-
-
-def _time_of(message: Message) -> int:
-    return message[0]

@@ -121,7 +121,7 @@ class _Builder:
         if event.tag is not None and str(event.tag) not in (f"{_TAG}map", f"{_TAG}seq", "!"):
             raise _problem(event, f"the tag {event.tag} is not known here")
         if kind == "SequenceStartEvent":
-            return list(self._items("SequenceEndEvent", depth))
+            return [self._value(item, depth + 1) for item in self._until("SequenceEndEvent")]
         mapping: dict[Any, Any] = {}
         for at in self._until("MappingEndEvent"):
             if getattr(at, "value", None) == "<<" and at.implicit[0]:
@@ -133,10 +133,6 @@ class _Builder:
                 raise _problem(at, f"the key '{key}' is there twice")
             mapping[key] = self._value(next(self._events), depth + 1)
         return mapping
-
-    def _items(self, end: str, depth: int) -> Iterator[Any]:
-        for event in self._until(end):
-            yield self._value(event, depth + 1)
 
     def _until(self, end: str) -> Iterator[Any]:
         while type(event := next(self._events)).__name__ != end:

@@ -6,12 +6,12 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
+from terrafusion.datasets.core.channels import Channel, Fix, Gnss, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
@@ -26,6 +26,7 @@ from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of,
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
 
+C = TypeVar("C", bound=Channel)
 NOMINAL_DATUM = (0.0, 0.0, 0.0)
 """ENU origin of a recording that has none: latitude, longitude (deg), height (m)."""
 
@@ -165,18 +166,17 @@ class _Parts:
         """Topics of the channels: standard messages, then the tables of those they cannot hold."""
         r = self.recording
         if r.command is not None:
-            yield ros.command(self._complete("command", r.command, r.command.columns()))
+            yield ros.command(self._complete(r.command))
         if r.wheels is not None:
             yield from self._wheels(r.wheels)
         if r.imu is not None:
-            yield self._imu(r.imu)
+            yield ros.imu(self._complete(r.imu), self._imu_frame())
         if r.steering is not None:
-            yield ros.steering(self._complete("steering", r.steering, r.steering.columns()))
+            yield ros.steering(self._complete(r.steering))
         if r.barometer is not None:
-            yield ros.pressure(self._complete("barometer", r.barometer, r.barometer.columns()))
+            yield ros.pressure(self._complete(r.barometer))
         if r.magnetometer is not None:
-            complete = self._complete("magnetometer", r.magnetometer, r.magnetometer.columns())
-            yield ros.magnetic_field(complete, self._imu_frame())
+            yield ros.magnetic_field(self._complete(r.magnetometer), self._imu_frame())
         if r.gnss is not None:
             yield from self._gnss(r.gnss)
         if r.terrain is not None:
@@ -200,10 +200,10 @@ class _Parts:
             for name, column in table.columns.items()
         }
 
-    def _complete(self, name: str, channel: Any, values: dict[str, NDArray[Any]]) -> Any:
+    def _complete(self, channel: C) -> C:
         """The rows of a channel without missing values; where others are left out it gets a table."""
-        full = np.ones(len(channel), dtype=bool)
-        for column in values.values():
+        full, name = np.ones(len(channel), dtype=bool), channel.name
+        for column in channel.columns().values():
             full &= np.isfinite(column)
         if not full.all() or not len(channel):
             self.only_here.add(name)
@@ -214,11 +214,8 @@ class _Parts:
     def _imu_frame(self) -> str:
         return "imu_link" if "imu_link" in self._positions() else "base_link"
 
-    def _imu(self, imu: Imu) -> TopicMessages:
-        return ros.imu(self._complete("imu", imu, imu.columns()), self._imu_frame())
-
     def _wheels(self, wheels: Wheels) -> Iterator[TopicMessages]:
-        complete: Wheels = self._complete("wheels", wheels, wheels.columns())
+        complete = self._complete(wheels)
         if wheels.unit == "radps" and wheels.has_sides():
             yield ros.joint_states(complete)
             return

@@ -70,7 +70,10 @@ def tables_of(recording: Recording) -> dict[str, OutputTable]:
     for name in Recording.CHANNELS:
         channel = getattr(recording, name)
         if channel is not None:
-            columns = _all_axes(channel) if isinstance(channel, Imu) else channel.columns()
+            columns = channel.columns()
+            if isinstance(channel, Imu) and not columns:  # a table needs columns
+                both = np.hstack([channel.gyro_radps, channel.accel_mps2])
+                columns = dict(zip((*GYRO, *ACCEL), both.T, strict=True))
             tables[name] = OutputTable(channel.t_ns, columns)
     if recording.truth is not None:
         q = recording.truth.quaternion
@@ -78,12 +81,6 @@ def tables_of(recording: Recording) -> dict[str, OutputTable]:
             raise DataError("quaternions are not of norm 1", channel="truth", remedy="normalise them")
         tables["truth"] = OutputTable(recording.truth.t_ns, truth_columns(recording.truth))
     return tables
-
-
-def _all_axes(imu: Imu) -> dict[str, NDArray[Any]]:
-    """The axes that hold a value, or all where none does: a table needs columns."""
-    both = np.hstack([imu.gyro_radps, imu.accel_mps2])
-    return imu.columns() or {name: both[:, k] for k, name in enumerate((*GYRO, *ACCEL))}
 
 
 def truth_columns(truth: Trajectory) -> dict[str, NDArray[Any]]:

@@ -331,9 +331,6 @@ class ChannelBuilder:
         twist[variance >= UNKNOWN_VARIANCE] = np.nan
         return twist if np.nan_to_num(twist).any() else None
 
-    def _since(self, t_ns: np.int64) -> float:
-        return float(t_ns - self.start_ns) * 1e-9
-
     def _refuse_nan(self, values: Array, t_ns: TimesNs, topic: str, what: str = "value") -> None:
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
@@ -341,6 +338,6 @@ class ChannelBuilder:
             raise DataError(
                 f"{int(bad.sum())} of {len(values)} messages have a {what} that is not a finite number",
                 channel=topic,
-                time_s=self._since(t_ns[i]),
+                time_s=float(t_ns[i] - self.start_ns) * 1e-9,
                 remedy="correct the driver, or filter these messages out of the bag",
             )

@@ -37,7 +37,7 @@ class Db3File:
 
     def __init__(self, path: Path, counts: Mapping[str, int] | None = None) -> None:
         _refuse_cut(path)
-        self._path, self._bytes, self._steps = path, path.stat().st_size, 0
+        self._bytes, self._steps = path.stat().st_size, 0
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         self._database = sqlite3.connect(uri, uri=True)
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MESSAGE_BYTES)

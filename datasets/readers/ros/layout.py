@@ -251,7 +251,8 @@ class MessageDecoder:
             columns[name] = column.astype(column.dtype.newbyteorder("="), order="C")
         for path, (places, listed) in layout.words.items():
             words = [self._words(raw[:, at : at + size]) for at, size in places]
-            columns[path] = _listed(words, len(raw)) if listed else words[0]
+            none = np.empty((len(raw), 0), dtype=object)
+            columns[path] = (np.stack(words, axis=1) if words else none) if listed else words[0]
         shape = tuple((path, column.dtype, column.shape[1:]) for path, column in columns.items())
         self._pieces.setdefault(shape, []).append(MessageBlock(rows, columns))
 
@@ -282,10 +283,6 @@ class MessageDecoder:
         self._receipts.clear()
         self.count = 0
         return receipt_ns, blocks
-
-
-def _listed(words: list[NDArray[Any]], n: int) -> NDArray[Any]:
-    return np.stack(words, axis=1) if words else np.empty((n, 0), dtype=object)
 
 
 def _joined(pieces: list[MessageBlock]) -> MessageBlock:

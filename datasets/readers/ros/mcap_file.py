@@ -57,8 +57,7 @@ class McapFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._file = path, path.open("rb")
-        self._end = path.stat().st_size
+        self._file, self._end = path.open("rb"), path.stat().st_size
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._chunks: list[_ChunkPlace] = []
@@ -164,13 +163,10 @@ class McapFile:
         while first < len(self._loose):
             begin = int(self._loose[first])
             last = max(int(np.searchsorted(self._loose, begin + BLOCK_BYTES)) - 1, first)
-            end = self._record_end(int(self._loose[last]))
+            _, size = _head(self._read(int(self._loose[last]), RECORD_HEAD), 0)
+            end = int(self._loose[last]) + RECORD_HEAD + int(size)
             yield from _split(self._read(begin, end - begin), self._loose[first : last + 1] - begin, wanted)
             first = last + 1
-
-    def _record_end(self, position: int) -> int:
-        _, size = _head(self._read(position, RECORD_HEAD), 0)
-        return position + RECORD_HEAD + int(size)
 
     def _unpacked(self, wanted: Groups) -> Iterator[bytes]:
         """The chunks that may hold messages of these channels; all where none are named."""

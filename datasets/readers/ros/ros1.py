@@ -69,8 +69,7 @@ class Ros1File:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._file = path, path.open("rb")
-        self._end = path.stat().st_size
+        self._file, self._end = path.open("rb"), path.stat().st_size
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
         try:

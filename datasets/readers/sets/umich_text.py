@@ -81,7 +81,9 @@ def read(request: Request) -> list[Recording]:
     rows = {part.kind: read_rows(part.path, COLUMNS[part.kind]) for part in parts}
     rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
     rows, apart = _contemporaries(rows, given.kind)
-    notes = [_joined(given, rows), *apart, *clock, *(note for r in rows.values() for note in r.notes)]
+    others = ", ".join(r.path.name for r in rows.values() if r.path != given.path)
+    joined = f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
+    notes = [joined, *apart, *clock, *(note for r in rows.values() for note in r.notes)]
     truth, truth_notes = _truth(rows)
     truth_kind = "center" if "center" in rows else "front"
     wheels, wheel_notes = _wheels(rows.get("wheels"), given.kind == "wheels")
@@ -120,22 +122,16 @@ def _family(given: RecordingFile) -> tuple[str, list[RecordingFile]]:
     """
     found = [part for path in sorted(given.path.parent.glob("*.txt")) if (part := _part(path)) is not None]
     robots = {_robot_name(p.stem) for p in found if p.kind in ("imu", "wheels")}
-    name = _robot_name(given.stem)
-    if given.kind in ("center", "front"):
-        name = max((r for r in robots if _belongs(given.stem, r)), key=len, default=given.stem)
+    name = _owner(given, robots)
     own = [p for p in found if _owner(p, robots) == name]
     kinds = dict.fromkeys([given.kind, *(p.kind for p in own)])
     return name, [_choice(given, kind, [p for p in own if p.kind == kind]) for kind in kinds]
 
 
-def _belongs(stem: str, robot: str) -> bool:
-    return stem == robot or stem.startswith(f"{robot}_")
-
-
 def _owner(part: RecordingFile, robots: Iterable[str]) -> str:
     if part.kind in ("imu", "wheels"):
         return _robot_name(part.stem)
-    return max((r for r in robots if _belongs(part.stem, r)), key=len, default=part.stem)
+    return max((r for r in robots if f"{part.stem}_".startswith(f"{r}_")), key=len, default=part.stem)
 
 
 def _choice(given: RecordingFile, kind: str, candidates: list[RecordingFile]) -> RecordingFile:
@@ -159,11 +155,6 @@ def _contemporaries(rows: dict[str, NumberRows], given: str) -> tuple[dict[str, 
         for kind, r in rows.items()
         if kind not in shared
     ]
-
-
-def _joined(given: RecordingFile, rows: dict[str, NumberRows]) -> str:
-    others = ", ".join(r.path.name for r in rows.values() if r.path != given.path)
-    return f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
 
 
 def _imu(rows: NumberRows) -> Imu:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -65,7 +65,8 @@ def _dated(epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
         first_days = date - day  # the date of the log's first day, as each dated epoch has it
         known = np.flatnonzero(np.isfinite(first_days))
         nearest = known[np.clip(np.searchsorted(known, np.arange(len(day)), side="right") - 1, 0, None)]
-        first, notes = first_days[nearest], _date_notes(first_days[known])
+        first, changes = first_days[nearest], int((np.diff(first_days[known]) != 0).sum())
+        notes = [f"gnss: the date jumps {changes} times beyond midnights"] if changes else []
         off = first[0] - _receipt_days(epochs)
         weeks = round(off / WEEKS_1024_DAYS) if np.isfinite(off) else 0
         if weeks and abs(off - weeks * WEEKS_1024_DAYS) <= 1.0:
@@ -83,11 +84,6 @@ def _dated(epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
         first = np.zeros(len(day))
         notes = ["gnss: no sentence has a date: times are those of day 0, 1970-01-01"]
     return (day + first).astype(np.int64) * DAY_NS + epochs.column("of_day_ns"), notes
-
-
-def _date_notes(first_days: Array) -> list[str]:
-    changes = int((np.diff(first_days) != 0).sum())
-    return [f"gnss: the date jumps {changes} times beyond midnights"] if changes else []
 
 
 def _receipt_days(epochs: NmeaEpochs) -> float:
