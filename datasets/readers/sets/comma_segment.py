@@ -44,9 +44,9 @@ FORWARD_LEFT_UP = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Times (N,) in ns since the device was switched on, and values (N, k)."""
+    """Times (N,) in ns, as read since the device was switched on, then Unix time; and values (N, k)."""
 
-    boot_ns: TimesNs
+    t_ns: TimesNs
     value: Array
 
 
@@ -83,25 +83,16 @@ def read(request: Request) -> list[Recording]:
     poses = {name: _array(folder / POSE / name, size) for name, size in FRAMES.items()}
     frames = {name: values for name, values in poses.items() if values is not None}
     clock_ns, notes = _unix_less_boot(signals["GNSS/live_gnss_ublox"], frames)
-    times = {n: row_times(request, n, s.boot_ns + clock_ns) for n, s in signals.items() if s is not None}
-    values = {n: s.value[times[n].order] for n, s in signals.items() if s is not None}
-    gnss, datum, about_fixes = _gnss(request, values.get("GNSS/live_gnss_ublox"))
-    imu, about_imu = _imu(
-        {n: (times[n].t_ns, values[n]) for n in ("IMU/gyro", "IMU/accelerometer") if n in values}
-    )
+    times = {n: row_times(request, n, s.t_ns + clock_ns) for n, s in signals.items() if s is not None}
+    found = {n: Signal(times[n].t_ns, s.value[times[n].order]) for n, s in signals.items() if s is not None}
+    gnss, datum, about_fixes = _gnss(request, found.get("GNSS/live_gnss_ublox"))
+    imu, about_imu = _imu({n: signal for n, signal in found.items() if SIGNALS[n][1] == "imu"})
     truth, datum = _truth(request, frames, clock_ns, datum)
-    wheels, steering = "CAN/wheel_speed", "CAN/steering_angle"
-    channels: dict[str, Any] = {
-        "wheels": Wheels(times[wheels].t_ns, values[wheels], Wheels.LAYOUTS[1], "mps")
-        if wheels in values
-        else None,
-        "steering": Steering(times[steering].t_ns, np.radians(values[steering]), ("steering_wheel",))
-        if steering in values
-        else None,
-        "imu": imu,
-        "gnss": gnss,
-        "truth": truth,
-    }
+    channels: dict[str, Any] = {"imu": imu, "gnss": gnss, "truth": truth}
+    if (wheels := found.get("CAN/wheel_speed")) is not None:
+        channels["wheels"] = Wheels(wheels.t_ns, wheels.value, Wheels.LAYOUTS[1], "mps")
+    if (steering := found.get("CAN/steering_angle")) is not None:
+        channels["steering"] = Steering(steering.t_ns, np.radians(steering.value), ("steering_wheel",))
     firsts = [int(channel.t_ns[0]) for channel in channels.values() if channel is not None and len(channel)]
     if not firsts:
         remedy = f"give a folder that holds {', '.join(f'{LOG}/{name}' for name in SIGNALS)}"
@@ -174,7 +165,7 @@ def _unix_less_boot(gnss: Signal | None, frames: dict[str, Array]) -> tuple[np.i
     utc = gnss.value[:, 3] if gnss is not None else np.zeros(0)
     if gnss is not None and _is_utc_ms(utc).any():
         held = _is_utc_ms(utc)
-        late = np.median(gnss.boot_ns[held] - np.rint(utc[held] * 1e6).astype(np.int64))
+        late = np.median(gnss.t_ns[held] - np.rint(utc[held] * 1e6).astype(np.int64))
         return np.int64(-late), [
             "times: the device's clock is set by the receiver's UTC, which comes some 0.1 s late"
         ]
@@ -185,13 +176,13 @@ def _is_utc_ms(utc: Array) -> Mask:
     return np.asarray((utc > 1e11) & (utc < 4e12))
 
 
-def _gnss(request: Request, rows: Array | None) -> tuple[Gnss | None, Datum | None, list[str]]:
+def _gnss(request: Request, signal: Signal | None) -> tuple[Gnss | None, Datum | None, list[str]]:
     """Fixes at their own UTC; speed and bearing give the velocity."""
-    if rows is None:
+    if signal is None:
         return None, None, []
-    held = _is_utc_ms(rows[:, 3])
+    held = _is_utc_ms(signal.value[:, 3])
     notes = [] if held.all() else [f"gnss: {int((~held).sum())} fixes without UTC left out"]
-    rows = rows[held]
+    rows = signal.value[held]
     if not len(rows):
         return None, None, notes
     t_ns = np.rint(rows[:, 3] * 1e6).astype(np.int64)
@@ -210,20 +201,19 @@ def _gnss(request: Request, rows: Array | None) -> tuple[Gnss | None, Datum | No
     return gnss, datum, [*notes, "gnss: times are the fixes' own UTC", *about]
 
 
-def _imu(found: dict[str, tuple[TimesNs, Array]]) -> tuple[Imu | None, list[str]]:
+def _imu(found: dict[str, Signal]) -> tuple[Imu | None, list[str]]:
     """Rates and specific forces at the rates' times."""
     if not found:
         return None, []
-    t_ns = next(iter(found.values()))[0]
+    t_ns = next(iter(found.values())).t_ns
     groups, notes = [], []
     for name in ("IMU/gyro", "IMU/accelerometer"):
-        times, values = found.get(name, (t_ns, np.full((len(t_ns), 3), np.nan)))
-        if not np.array_equal(times, t_ns):
+        signal = found.get(name, Signal(t_ns, np.full((len(t_ns), 3), np.nan)))
+        values = signal.value
+        if not np.array_equal(signal.t_ns, t_ns):
             notes.append(f"imu: {name} has times of its own; interpolated at those of the gyro")
-            since = (times - t_ns[0]) * 1e-9
-            values = np.stack(
-                [np.interp((t_ns - t_ns[0]) * 1e-9, since, column) for column in values.T], axis=1
-            )
+            own_s, wanted_s = (signal.t_ns - t_ns[0]) * 1e-9, (t_ns - t_ns[0]) * 1e-9
+            values = np.stack([np.interp(wanted_s, own_s, column) for column in values.T], axis=1)
         groups.append(values)
     return Imu(t_ns, groups[0], groups[1]), notes
 
