@@ -44,12 +44,15 @@ WIDE_RAD = 0.3
 class MountingTilt:
     """Learns roll and pitch, the angles by which readings are turned about x, then y, into body axes.
 
+    An accelerometer's bias, 1 sigma `bias_mps2`, looks to heights as its tilt does.
+
     Attributes:
         turns: (roll, pitch) by the gyro, None until enough turns.
         driven_m: distance so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, bias_mps2: float) -> None:
+        self._height_sigma_rad = math.hypot(bias_mps2 / GRAVITY_MPS2, LEAST_SIGMA_RAD)
         self._window, self._window_s = np.zeros(3), 0.0
         self._windows: list[Array] = []
         self._sum, self._outer = np.zeros(3), np.zeros((3, 3))
@@ -78,7 +81,9 @@ class MountingTilt:
     def heights(self) -> Angle:
         """Pitch by heights."""
         scale = max(1.0, self._squares / max(self._count, 1))
-        return Angle(float(self._mean[2]), math.hypot(math.sqrt(scale * self._P[2, 2]), LEAST_SIGMA_RAD))
+        return Angle(
+            float(self._mean[2]), math.hypot(math.sqrt(scale * self._P[2, 2]), self._height_sigma_rad)
+        )
 
     def add(self, dt_s: float, speed_mps: float, gyro_radps: Array, force_mps2: Array) -> bool:
         """Motion over `dt_s`; True when the angles of the turns changed."""

@@ -51,9 +51,11 @@ class ImuLevel:
     """
 
     def __init__(self, config: EstimatorConfig, imu: ImuStream) -> None:
-        self._imu, self._seen, self._new = imu, MountingTilt(), False
         spec = config.rig.sensors.imu
+        self._imu, self._new = imu, False
         self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
+        self._accel_sigma_mps2 = spec.accel_bias_sigma_mps2
+        self.restart()
         self._six_axis = config.inputs.imu == "six_axis"
         self.start_from(_priors(config.rig.known))
 
@@ -85,7 +87,7 @@ class ImuLevel:
 
     def restart(self) -> None:
         """The axes were others than thought: begin to learn anew."""
-        self._seen = MountingTilt()
+        self._seen = MountingTilt(self._accel_sigma_mps2)
 
     def interrupt(self) -> None:
         """Motion is missing."""

@@ -27,12 +27,13 @@ def driven(
     height_sigma_m: float = math.nan,
     claimed_m: float = math.nan,
     height_time_s: float = 100.0,
+    bias_mps2: float = 0.02,
 ) -> MountingTilt:
     """A robot that stands on its ground, a slope towards east with hills on it, and turns at random.
 
     `mounted` (3, 3) turns body axes into those of the IMU; heights wander by `height_sigma_m`.
     """
-    rng, tilt = np.random.default_rng(seed), MountingTilt()
+    rng, tilt = np.random.default_rng(seed), MountingTilt(bias_mps2)
     waves, phases = rng.normal(0.0, 1.0 / 6.0, (20, 2)), rng.uniform(0.0, math.tau, 20)
     steep = hills_rad / math.sqrt(20.0) / np.linalg.norm(waves, axis=1)
     place, yaw, rate, wander_m, before = np.zeros(2), 0.0, 0.0, rng.normal() * height_sigma_m, np.eye(3)
@@ -49,6 +50,7 @@ def driven(
         gyro = gtsam.Rot3.Logmap(gtsam.Rot3(before.T @ body)) / STEP_S if k else np.zeros(3)
         force = body.T @ [0.0, 0.0, GRAVITY_MPS2] + [0.0, SPEED_MPS * gyro[2], 0.0]
         readings = np.array([gyro + rng.normal(0.0, 0.01, 3) + 0.02, force + rng.normal(0.0, 0.3, 3)])
+        readings[1, 0] += bias_mps2
         if mounted is not None:
             readings = readings @ mounted.T
         tilt.add(STEP_S, SPEED_MPS, *readings)
@@ -79,6 +81,12 @@ def test_heights_tell_pitch_of_a_straight_drive_and_a_slope_is_none() -> None:
             tilt = driven(seed, 600.0, mounted=mounted, slope=0.12, turning=0.02, height_sigma_m=3.0)
             assert tilt.heights.sigma_rad < math.radians(1.0)
             assert abs(tilt.heights.rad - truth) < 3.0 * tilt.heights.sigma_rad
+
+
+def test_a_bias_of_the_accelerometer_that_its_data_sheet_allows_is_no_tilt() -> None:
+    tilt = driven(2, 600.0, turning=0.02, height_sigma_m=3.0, bias_mps2=0.5)
+    assert abs(tilt.heights.rad) > math.radians(2.0)
+    assert abs(tilt.angles()[1].rad) < 2.0 * tilt.angles()[1].sigma_rad
 
 
 def test_a_short_drive_beside_wandering_heights_tells_nothing() -> None:
