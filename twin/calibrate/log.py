@@ -62,6 +62,14 @@ class PreparedLog:
         """Length of what is compared, s."""
         return float(self.windows[-1, 1] - self.windows[0, 0]) * DT_S
 
+    def samples(self, every: int = 1) -> NDArray[np.int64]:
+        """Each n-th grid sample of all windows in turn; a border belongs to both."""
+        return np.concatenate([np.arange(first, last + 1, every) for first, last in self.windows])
+
+    def first_samples(self) -> NDArray[np.int64]:
+        """Index (W + 1,) of each window's first sample among those of all windows."""
+        return np.cumsum(np.append(0, np.diff(self.windows, axis=1).ravel() + 1))
+
 
 def prepare(
     recording: Recording,

@@ -54,56 +54,54 @@ def predict(log: PreparedLog, model: Model, names: Sequence[str], start: Array) 
     Raises:
         TerrafusionError: the run diverged.
     """
-    plant, directions = plant_of(log, model, names)
+    plant = plant_of(log, model)
+    directions = _directions(log, model, plant, names)
     inputs = delayed_inputs(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
     states, changes = _run(log, plant, directions, inputs, start)
-    samples = np.concatenate([np.arange(first, last + 1) for first, last in log.windows])
-    channels = tuple(o.channel for o in log.observed)
+    channels, samples = tuple(o.channel for o in log.observed), log.samples()
     values, by_direction = readings(
         channels, model, plant, directions, samples * DT_S, states, changes, inputs[samples]
     )
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
     count, out = len(names), []
     for i, observed in enumerate(log.observed):
-        at, weight = averaging(observed, log, shift)
+        at, weight = averaging(observed, log)
         change = np.einsum("nk,nkm->nm", weight, by_direction[at, i])
         value = np.einsum("nk,nk->n", weight, values[at, i])
         out.append(Prediction(value, change[:, :count], change[:, count:]))
     return out
 
 
-def plant_of(log: PreparedLog, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
-    """The plant, and as directions the named numbers, then x, y and yaw of a start."""
-    route = route_of(log, model)
-    vehicle, count = model.vehicle_vector(), len(names)
-    plant = Plant(vehicle, route, {k: v for k, v in model.effects.items() if v != 0.0})
+def plant_of(log: PreparedLog, model: Model) -> Plant:
+    """The plant that drives a log. Where the twin follows measured wheels its speed loop is stiff: critically
+    damped with a short motor lag, and no limit of torque."""
+    vehicle = model.vehicle_vector()
+    if log.follows:
+        at = {name: VEHICLE_PARAMETERS.index(name) for name in FOLLOWING}
+        lag = min(float(vehicle[at["lag_s"]]), _FOLLOWING_LAG_S)
+        gain = float(vehicle[VEHICLE_PARAMETERS.index("wheel_inertia_kgm2")]) / (4.0 * lag)
+        vehicle[at["lag_s"]], vehicle[at["loop_p_nms"]] = lag, gain
+        vehicle[at["loop_i_nm"]], vehicle[at["dead_time_s"]] = _FOLLOWING_RATE * gain, 0.0
+        vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] = 0.0
+        for name in ("torque_limit_nm", "stall_torque_nm"):
+            vehicle[at[name]] *= 1000.0
+    return Plant(vehicle, route_of(log, model), {k: v for k, v in model.effects.items() if v != 0.0})
+
+
+def _directions(log: PreparedLog, model: Model, plant: Plant, names: Sequence[str]) -> Directions:
+    """The named numbers, then x, y and yaw of a start."""
     effects = [name.removeprefix("effects.") for name in names if name.startswith("effects.")]
-    d = Directions.zeros(plant, count + len(POSE), effects)
-    knots = _knot_labels(log)
+    d = Directions.zeros(plant, len(names) + len(POSE), effects)
     for m, name in enumerate(names):
         if name.startswith("effects."):
             d.effects[name.removeprefix("effects.")][m] = 1.0
         elif name.startswith("vehicle."):
             d.vehicle[:, m] = model.vehicle_change(name)
         else:
-            for k, label in enumerate(knots):
+            for k, label in enumerate(_knot_labels(log)):
                 d.soil[k, :, m] = model.soil_change(name, label)
     if log.follows:
-        _follow(vehicle, d)
-    return plant, d
-
-
-def _follow(vehicle: Array, d: Directions) -> None:
-    """Make the speed loop stiff: critically damped with a short motor lag, and no limit of torque."""
-    at = {name: VEHICLE_PARAMETERS.index(name) for name in FOLLOWING}
-    lag = min(float(vehicle[at["lag_s"]]), _FOLLOWING_LAG_S)
-    gain = float(vehicle[VEHICLE_PARAMETERS.index("wheel_inertia_kgm2")]) / (4.0 * lag)
-    vehicle[at["lag_s"]], vehicle[at["loop_p_nms"]] = lag, gain
-    vehicle[at["loop_i_nm"]], vehicle[at["dead_time_s"]] = _FOLLOWING_RATE * gain, 0.0
-    vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] = 0.0
-    for name in ("torque_limit_nm", "stall_torque_nm"):
-        vehicle[at[name]] *= 1000.0
-    d.vehicle[list(at.values())] = 0.0
+        d.vehicle[[VEHICLE_PARAMETERS.index(name) for name in FOLLOWING]] = 0.0
+    return d
 
 
 def route_of(log: PreparedLog, model: Model) -> RouteTable:
@@ -191,7 +189,7 @@ def run_up(log: PreparedLog, plant: Plant, inputs: Array) -> tuple[Array, Array]
 
 
 def averaging(
-    observed: Observed, log: PreparedLog, shift: NDArray[np.int64], window: NDArray[np.int64] | None = None
+    observed: Observed, log: PreparedLog, window: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], Array]:
     """Stacked samples (n, k) that a row depends on, and their weights (n, k): its mean over its interval.
 
@@ -210,7 +208,7 @@ def averaging(
     # Straight on beyond an end: f(end + d) = (1 + d) f(end) - d f(end - 1), likewise before the start.
     columns = [inside, inside, np.broadcast_to(first + 1, at.shape), np.broadcast_to(last - 1, at.shape)]
     weights = [weight, before + after, -before, -after]
-    return np.hstack(columns) - first + shift[window][:, None], np.hstack(weights)
+    return np.hstack(columns) - first + log.first_samples()[window][:, None], np.hstack(weights)
 
 
 def _kernel(s: Array) -> Array:

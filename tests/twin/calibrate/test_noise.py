@@ -82,7 +82,7 @@ def test_mean_over_an_interval_is_exact_for_parabolas(c: list[float], begin: flo
     log = PreparedLog(
         "x", np.zeros((101, 2)), False, ("a",), none, windows, np.zeros((1, 3)), (rows,), True, ()
     )
-    at, weight = averaging(rows, log, np.zeros(1, dtype=int))
+    at, weight = averaging(rows, log)
     t = 0.01 * np.arange(101)
     f = c[0] + c[1] * t + c[2] * t**2
     a, b = begin, begin + length

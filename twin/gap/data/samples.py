@@ -44,7 +44,7 @@ def sample_map(log: PreparedLog) -> SampleMap:
     """The sample map of a log, computed once."""
     known = _CACHE.get(log)
     if known is None:
-        fine = [drop_zero_weights(*averaging(o, log, window_starts(log))) for o in log.observed]
+        fine = [drop_zero_weights(*averaging(o, log)) for o in log.observed]
         blocks = _blocks(log)
         coarse = [_coarse(o, log) for o in log.observed]
         known = _CACHE[log] = SampleMap(blocks, _equally_spaced(log, blocks), fine, coarse)
@@ -58,19 +58,9 @@ def with_observed(log: PreparedLog, observed: Sequence[Observed]) -> PreparedLog
     return out
 
 
-def window_starts(log: PreparedLog) -> Indices:
-    """Index (W + 1,) of each window's first sample among those of all windows."""
-    return np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-
-
-def grid_samples(log: PreparedLog, every: int) -> Indices:
-    """Grid samples of all windows in turn; a border belongs to both."""
-    return np.concatenate([np.arange(first, last + 1, every) for first, last in log.windows])
-
-
 def coarse_subset(log: PreparedLog) -> Indices:
     """Which of all samples of the windows are the coarse ones."""
-    starts = window_starts(log)
+    starts = log.first_samples()
     counts = np.diff(starts)
     return np.concatenate(
         [b + np.arange(0, n, COARSE_STEP) for b, n in zip(starts[:-1], counts, strict=True)]

@@ -17,6 +17,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.null.score import without_states
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 
@@ -79,7 +80,7 @@ def metric(runs: Sequence[Products], weight: Array, sigma: Array, robot: RobotOf
     P = runs[0].shared
     total = np.zeros((runs[0].gram.shape[1] - len(sigma),) * 2)
     for run in runs:
-        rest = without_states(run, weight, sigma)
+        rest = without_states(np.tensordot(weight, run.gram, axes=1), sigma)
         rest[:, -1] -= rest[:, :P] @ robot.mean
         rest[-1] -= robot.mean @ rest[:P]
         total += beyond_scatter(rest, robot)
@@ -99,13 +100,6 @@ def beyond_robot(products: Array, robot: RobotOffsets) -> Array:
     P, V = len(robot.mean), robot.covariance
     own = np.linalg.solve(np.eye(P) + V @ products[:P, :P], V @ products[:P])
     return products - products[:, :P] @ own
-
-
-def without_states(run: Products, weight: Array, sigma: Array) -> Array:
-    """Inner products of all columns but the states, which are projected out with their prior."""
-    G, T = np.tensordot(weight, run.gram, axes=1), len(sigma)
-    rest = G[T:, T:] - G[T:, :T] @ np.linalg.solve(G[:T, :T] + np.diag(sigma**-2.0), G[:T, T:])
-    return np.asarray(rest)
 
 
 def energies(run: Products, used: Array, weight: Array, sigma: Array, robot: RobotOffsets) -> Array:

@@ -28,11 +28,17 @@ class Score:
     A: Array
 
 
+def without_states(gram: Array, sigma: Array) -> Array:
+    """Inner products (M, M) of all columns but the states, those (T + M, T + M) of all given, with theta of
+    1 sigma (T,) projected out."""
+    T = len(sigma)
+    solved = np.linalg.solve(gram[:T, :T] + np.diag(sigma**-2.0), gram[:T, T:])
+    return np.asarray(gram[T:, T:] - gram[:T, T:].T @ solved)
+
+
 def score(run: WhitenedRun, sigma: Array) -> Score:
     """The score of a run with theta of the given 1 sigma (T,)."""
-    T, G = run.states, run.gram
-    solved = np.linalg.solve(run.state_information(sigma), G[:T, T:])
-    rest = G[T:, T:] - G[:T, T:].T @ solved
+    rest = without_states(run.gram, sigma)
     return Score(rest[:-1, -1].copy(), rest[:-1, :-1].copy())
 
 

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.predict import LEAD_S, POSE, plant_of, run_up
+from terrafusion.twin.calibrate.predict import LEAD_S, POSE, plant_of, route_of, run_up
 from terrafusion.twin.engine import codegen
 from terrafusion.twin.engine.codegen import LANES, LANES_32, Variant
 from terrafusion.twin.engine.integrate import compiled
@@ -24,7 +24,7 @@ from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
 from terrafusion.twin.engine.native import driver
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import Indices, grid_samples
+from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
@@ -119,7 +119,7 @@ def make_lanes(
     bases, inputs, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
     for log, effects, start in runs:
         if id(log) not in bases:
-            bases[id(log)], _ = plant_of(log, dataclasses.replace(model, effects={}), [])
+            bases[id(log)] = plant_of(log, dataclasses.replace(model, effects={}))
         base = bases[id(log)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
@@ -145,7 +145,7 @@ def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
     """
     fleet = _fleet(lanes)
     x, spans = _initial_states(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
-    out = [np.empty((len(grid_samples(lane.log, every)), len(STATES))) for lane in lanes]
+    out = [np.empty((len(lane.log.samples(every)), len(STATES))) for lane in lanes]
     row, pose = [0] * len(lanes), [INDEX[name] for name in POSE]
     borders = np.unique(np.concatenate([span.ravel() for span in spans]))
     for p, q in itertools.pairwise(borders.tolist()):
@@ -197,7 +197,7 @@ class SampledSensors:
         self.keys, self.samples = frozenset(candidates.keys), samples
         self.sensing = self.keys - {*candidates.moving} | {*SOIL_KEYS} & self.keys
         self.mounting = mounting_vector(model.vehicle)
-        route = plant_of(log, dataclasses.replace(model, effects={}), [])[0].route
+        route = route_of(log, model)
         self.fixed = route.is_fixed()
         self.soil = route.soil[0] if self.fixed else route.along(route.soil, samples.astype(float) * DT_S)
         self._inputs: dict[int, tuple[Array, Array]] = {}

@@ -15,7 +15,7 @@ from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import LEAD_S, averaging
 from terrafusion.twin.effects.sensing import CLOCK_S
-from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map, window_starts
+from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map
 
 IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
@@ -44,7 +44,7 @@ def delayed_samples(log: PreparedLog, effects: Mapping[str, float]) -> list[tupl
                 observed, begin_s=observed.begin_s - delay_s, end_s=observed.end_s - delay_s
             )
             window = window_of(before if observed.channel in IMU else observed, log.windows)
-            out[i] = drop_zero_weights(*averaging(before, log, window_starts(log), np.maximum(window, 0)))
+            out[i] = drop_zero_weights(*averaging(before, log, np.maximum(window, 0)))
     return out
 
 

@@ -19,7 +19,6 @@ from terrafusion.twin.gap.data.samples import (
     COARSE_STEP,
     coarse_counts,
     coarse_subset,
-    grid_samples,
     sample_map,
     weighted_means,
 )
@@ -128,7 +127,7 @@ def predictions(
     for i, (r, some, start) in enumerate(zip(rollouts, effects, starts, strict=True)):
         shared.setdefault((id(r.log), motion_effects(candidates, some), id(start)), []).append(i)
     runs, moved = list(shared.values()), [key[1] for key in shared]
-    sensors = {id(r.log): SampledSensors(r.log, model, candidates, grid_samples(r.log, 1)) for r in rollouts}
+    sensors = {id(r.log): SampledSensors(r.log, model, candidates, r.log.samples()) for r in rollouts}
     out: list[list[Array] | None] = [None] * len(rollouts)
 
     def simulate(task: tuple[tuple[str, ...], list[int]]) -> None:
@@ -204,7 +203,7 @@ def _readings(
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Nominal outputs at every grid sample, nominal states (n, X) at the coarse ones, and there the outputs
     (n, Y) with each set of effects."""
-    sensors, read = SampledSensors(log, model, candidates, grid_samples(log, COARSE_STEP)), dict[str, Array]()
+    sensors, read = SampledSensors(log, model, candidates, log.samples(COARSE_STEP)), dict[str, Array]()
     for group in effect_groups(candidates):
         keys = [k for k in group if k in sets]
         nominal = NOMINAL in keys
@@ -217,7 +216,7 @@ def _readings(
                     file=log.name,
                     remedy="check the vehicle's and the soil's numbers",
                 )
-            every = SampledSensors(log, model, candidates, grid_samples(log, 1))
+            every = SampledSensors(log, model, candidates, log.samples())
             fine = every.read(states[0], lanes[0].plant, lanes[0].inputs, sets[NOMINAL])
             states = [x[coarse_subset(log)] for x in states]
             coarse, twin = states[0], lanes[0]
