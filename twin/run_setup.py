@@ -17,7 +17,7 @@ from terrafusion.twin.model.motion import BodyMotion, motion_of, wheel_shares
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import vehicle_vector
-from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_payload
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle, with_payload
 from terrafusion.twin.scenario.commands import DrivenStates, drive
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.route import Route
@@ -85,7 +85,7 @@ def set_up(
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.
     """
-    vehicle = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
+    vehicle = as_vehicle(vehicle)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     scenario = scenario.with_ground(terrain, slope_deg, cross_slope_deg)
     scenario = scenario.with_payload(payload_kg, payload_at_m)

@@ -2,15 +2,13 @@
 the catalogue is, its laws, and how to check it on the robot.
 """
 
-import difflib
 import functools
 import math
 import textwrap
 from pathlib import Path
 
-from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.twin.effects.catalogue import catalogue
+from terrafusion.twin.effects.catalogue import forms_of
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet
@@ -252,14 +250,7 @@ def explanation(effect: str) -> list[str]:
     Raises:
         ConfigError: no effect has this name.
     """
-    forms = [form for form in catalogue().values() if form.effect == effect]
-    if not forms:
-        names = sorted({form.effect for form in catalogue().values()})
-        near = difflib.get_close_matches(effect, names, 1)
-        raise ConfigError(
-            f"there is no effect '{effect}'",
-            remedy=f"did you mean {near[0]}?" if near else f"known are {', '.join(names)}",
-        )
+    forms = forms_of(effect)
     lines = [effect]
     if effect in effect_words():
         what, check = effect_words()[effect]

@@ -27,7 +27,7 @@ from terrafusion.twin.calibrate.start import (
     start_model,
     uniquely_named,
 )
-from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
 PARAMETERS = (
@@ -91,8 +91,7 @@ def calibrate(
     for key, value in (("slope_deg", slope_deg), ("aspect_deg", aspect_deg), ("payload_kg", payload_kg)):
         checked_number(value, _GROUND[key], file="the calibration", key=key)
     # The model to start from, and its unknown parameters.
-    robot = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
-    model, ground, notes = start_model(logs_in, robot, soils, effects)
+    model, ground, notes = start_model(logs_in, as_vehicle(vehicle), soils, effects)
     model = dataclasses.replace(
         model, slope_rad=math.radians(slope_deg), aspect_rad=math.radians(aspect_deg), payload_kg=payload_kg
     )

@@ -3,7 +3,7 @@
 import difflib
 import functools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
@@ -73,9 +73,24 @@ def lookup(key: str) -> tuple[Form, Parameter]:
     stem = key.split("/")[0]
     near = [name for name in known if name.split("/")[0] == stem]
     near = near or difflib.get_close_matches(key, list(known), n=3, cutoff=0.4)
-    near = near or [name for name in known if stem and stem in name][:3]
+    raise _unknown(key, near or [name for name in known if stem and stem in name][:3])
+
+
+def forms_of(effect: str) -> list[Form]:
+    """The forms of an effect.
+
+    Raises:
+        ConfigError: there is none; the nearest names are listed.
+    """
+    forms = [form for form in catalogue().values() if form.effect == effect]
+    if not forms:
+        raise _unknown(effect, difflib.get_close_matches(effect, effect_names(), n=3, cutoff=0.5))
+    return forms
+
+
+def _unknown(name: str, near: Sequence[str]) -> ConfigError:
     remedy = f"did you mean {' or '.join(near)}" if near else "see docs/reference/effects.md"
-    raise ConfigError(f"unknown effect '{key}'", remedy=remedy)
+    return ConfigError(f"unknown effect '{name}'", remedy=remedy)
 
 
 def parameter_key(name: str) -> str:

@@ -5,8 +5,6 @@ data -> rollout -> null -> infer -> answer
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from collections.abc import Callable, Sequence
 
 from terrafusion.datasets.core.arrays import Array
@@ -79,7 +77,6 @@ def diagnose(
         DataError: a log lacks what the diagnosis needs, or is given twice.
         TerrafusionError: the twin diverges on a log.
     """
-    began = time.perf_counter()
     if not runs:
         raise DataError("no run to diagnose was given", remedy="give at least one")
     if not 0.0 < significance < 1.0:
@@ -90,8 +87,7 @@ def diagnose(
     evidence = gather_evidence(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, cache=cache
     )
-    found = diagnose_evidence(evidence, vehicle.name, significance=significance, seed=seed, progress=progress)
-    return dataclasses.replace(found, elapsed_s=time.perf_counter() - began)
+    return diagnose_evidence(evidence, vehicle.name, significance=significance, seed=seed, progress=progress)
 
 
 def diagnose_evidence(
@@ -103,12 +99,7 @@ def diagnose_evidence(
     progress: Callable[[float], None] | None = None,
 ) -> GapDiagnosis:
     """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
-    began, candidates, runs, notes = (
-        time.perf_counter(),
-        evidence.candidates,
-        evidence.runs,
-        list(evidence.notes),
-    )
+    candidates, runs, notes = evidence.candidates, evidence.runs, list(evidence.notes)
     # null: how scores scatter where nothing has changed
     sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
     scores = [score(run, sigma) for run in runs]
@@ -140,7 +131,7 @@ def diagnose_evidence(
     following = planner.next_run(verdict)
     return GapDiagnosis(
         vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,
-        drives, evidence, tuple(notes), time.perf_counter() - began,
+        drives, evidence, tuple(notes),
     )  # fmt: skip
 
 

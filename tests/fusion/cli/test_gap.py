@@ -80,7 +80,7 @@ def test_gap_explains_an_effect(terrafusion) -> None:
     assert done.status == 0, done.err
     assert "check:" in done.out
     assert "dead_time/transport" in done.out
-    assert terrafusion("gap", "--explain", "dead_tim").refused("there is no effect 'dead_tim'", "dead_time")
+    assert terrafusion("gap", "--explain", "dead_tim").refused("unknown effect 'dead_tim'", "dead_time")
 
 
 def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, terrafusion) -> None:

@@ -229,7 +229,7 @@ def test_an_effect_of_ones_own_takes_part() -> None:
     own = Candidates.of()
     assert "trailer" in own.effects
     assert "trailer/drag" in own.moving
-    assert own.columns("trailer") == (own.keys.index("trailer/drag"),)
+    assert own.hypotheses[-1].columns == (own.keys.index("trailer/drag"),)
 
 
 def test_other_terramechanics_are_no_candidate_unless_asked_for() -> None:

@@ -33,7 +33,6 @@ class GapDiagnosis:
         drives: how far references cover the judged drives; None without references.
         evidence: for plots.
         notes: assumptions, in sentences.
-        elapsed_s: computing time.
     """
 
     vehicle: str
@@ -48,7 +47,6 @@ class GapDiagnosis:
     drives: DriveCoverage | None
     evidence: GapEvidence
     notes: tuple[str, ...]
-    elapsed_s: float
 
     @property
     def runs(self) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ An effect is one hypothesis and its forms are alternatives within it. A column i
 its typical size (`scale` of the catalogue), so that all columns are comparable.
 """
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -13,7 +12,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.effects.catalogue import catalogue, effect_names, lookup, moves, parameters
+from terrafusion.twin.effects.catalogue import catalogue, forms_of, lookup, moves, parameters
 from terrafusion.twin.effects.form import Form
 
 SOIL_STRENGTH = "soil_strength"
@@ -63,7 +62,12 @@ class Candidates:
             ConfigError: no effect, or an unknown one; the nearest names are listed.
         """
         wanted = None if effects is None else tuple(effects)
-        _check_names(wanted)
+        if wanted == ():
+            raise ConfigError(
+                "no effect is named", remedy="name some, or none at all for the whole catalogue"
+            )
+        for name in wanted or ():
+            forms_of(name)  # refuses unknown ones
         in_twin = {lookup(key)[0].key for key in present}
 
         def included(form: Form) -> bool:
@@ -94,22 +98,8 @@ class Candidates:
         """Whether one of these effects, by key, depends on position or heading in the world."""
         return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 
-    def columns(self, effect: str) -> tuple[int, ...]:
-        """All columns of an effect, of all its forms."""
-        return tuple(i for h in self.hypotheses if h.effect == effect for i in h.columns)
-
     def bounds(self, columns: Sequence[int]) -> tuple[Array, Array]:
         """Least and greatest values (k,) of some columns, in typical sizes."""
         at = list(columns)
         scale = self.scale[at]
         return RANGE_SHARE * self.low[at] / scale, RANGE_SHARE * self.high[at] / scale
-
-
-def _check_names(effects: tuple[str, ...] | None) -> None:
-    if effects is not None and not effects:
-        raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
-    for name in effects or ():
-        if name not in effect_names():
-            near = difflib.get_close_matches(name, effect_names(), n=3, cutoff=0.5)
-            remedy = f"did you mean {' or '.join(near)}" if near else "see docs/reference/effects.md"
-            raise ConfigError(f"unknown effect '{name}'", remedy=remedy)
