@@ -59,9 +59,8 @@ def predict(log: PreparedLog, model: Model, names: Sequence[str], start: Array) 
     inputs = delayed_inputs(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
     states, changes = _run(log, plant, directions, inputs, start)
     channels, samples = tuple(o.channel for o in log.observed), log.samples()
-    values, by_direction = readings(
-        channels, model, plant, directions, samples * DT_S, states, changes, inputs[samples]
-    )
+    t_s: Array = DT_S * samples.astype(float)
+    values, by_direction = readings(channels, model, plant, directions, t_s, states, changes, inputs[samples])
     count, out = len(names), []
     for i, observed in enumerate(log.observed):
         at, weight = averaging(observed, log)
