@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
@@ -25,7 +24,7 @@ from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import FEWEST, SCATTER_SCALES, learn_offsets
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.null.score import REPLICATES, Score, learn_state_sigma, replicates, score
+from terrafusion.twin.gap.null.score import learn_state_sigma, replicates, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.gap.threads import one_blas_thread
@@ -107,7 +106,8 @@ def diagnose_evidence(
     uncalibrated = len(normal) < FEWEST
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
-        normal = _with_replicates(evidence, sigma, normal, seed)
+        in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
+        normal += replicates(evidence.references or runs, sigma, in_common)
     scales = SCATTER_SCALES[-1:] if uncalibrated else SCATTER_SCALES
     offsets = learn_offsets(normal, len(candidates.keys), scales)
     planner = Planner.of(evidence, sigma, offsets, scores)
@@ -133,10 +133,3 @@ def diagnose_evidence(
         vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,
         drives, evidence, tuple(notes),
     )  # fmt: skip
-
-
-def _with_replicates(evidence: GapEvidence, sigma: Array, normal: list[Score], seed: int) -> list[Score]:
-    """References, and twin replicates around what they have in common."""
-    templates = evidence.references or evidence.runs
-    offset = learn_offsets(normal, len(evidence.candidates.keys)).mean if normal else None
-    return normal + replicates(templates, sigma, offset, REPLICATES, seed)

@@ -6,6 +6,7 @@ C(alpha) tests; here theta is random with variance Sigma, so it is projected out
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,28 +43,14 @@ def score(run: WhitenedRun, sigma: Array) -> Score:
     return Score(rest[:-1, -1].copy(), rest[:-1, :-1].copy())
 
 
-def replicates(
-    templates: Sequence[WhitenedRun], sigma: Array, offset: Array | None, count: int, seed: int
-) -> list[Score]:
-    """Scores of twin replicates of the templates, which differ by noise and theta alone.
+def replicates(templates: Sequence[WhitenedRun], sigma: Array, offset: Array | float) -> list[Score]:
+    """Expected scores of twin replicates of the templates, all of which have the parameters `offset` (P,).
 
-    They show the scatter that the twin itself predicts; a diagnosis that relies on them is uncalibrated.
-
-    Args:
-        offset: (P,) parameters that all references share; None: zero.
+    The scatter that is learned from them is the twin's own; a diagnosis that relies on it is uncalibrated.
     """
-    rng, out = np.random.default_rng(seed), []
-    for i in range(count):
-        run = templates[i % len(templates)]
-        error = run.by_state @ (sigma * rng.standard_normal(run.states))
-        error += run.without_poses(rng.standard_normal(len(run.time_s)))
-        if offset is not None:
-            error += run.by_parameter @ offset
-        inner = run.rows[:, :-1].astype(float).T @ error
-        solved = np.linalg.solve(run.state_information(sigma), inner[: run.states])
-        b = inner[run.states :] - run.gram[run.states : -1, : run.states] @ solved
-        out.append(Score(b, score(run, sigma).A))
-    return out
+    information = [score(run, sigma).A for run in templates]
+    every = itertools.islice(itertools.cycle(information), REPLICATES)
+    return [Score((A * offset).sum(axis=1), A) for A in every]
 
 
 def learn_state_sigma(runs: Sequence[WhitenedRun], first: Array) -> Array:
