@@ -11,7 +11,7 @@ import platform
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
 from importlib import metadata
@@ -21,6 +21,7 @@ from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.model.version import model_sha256, version
 
+K = TypeVar("K")
 T = TypeVar("T")
 
 BACKENDS = ("loky", "dask")
@@ -67,6 +68,15 @@ class Workers:
             yield from results
             if not done:
                 self.check()
+
+    def by_key(self, calls: Mapping[K, tuple[Callable[..., T], tuple[Any, ...]]]) -> Iterator[tuple[K, T]]:
+        """Results of calls (function, arguments) with their keys, in the order in which they finish; raises
+        as `results`."""
+        return self.results(_keyed, ((key, *call) for key, call in calls.items()))
+
+
+def _keyed(key: K, function: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[K, T]:
+    return key, function(*arguments)
 
 
 @contextlib.contextmanager

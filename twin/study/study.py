@@ -138,14 +138,9 @@ def _run_all(
     work: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]], workers: Workers, progress: Progress | None
 ) -> list[Any]:
     """The results of all calls, in the order of `work` whoever computes them."""
-    results: list[Any] = [None] * len(work)
-    numbered = ((number, function, arguments) for number, (function, arguments) in enumerate(work))
-    for done, (number, result) in enumerate(workers.results(_numbered, numbered), 1):
+    results: dict[int, Any] = {}
+    for number, result in workers.by_key(dict(enumerate(work))):
         results[number] = result
         if progress is not None:
-            progress(done / len(work))
-    return results
-
-
-def _numbered(number: int, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[int, Any]:
-    return number, function(*arguments)
+            progress(len(results) / len(work))
+    return [results[number] for number in range(len(work))]

@@ -25,7 +25,7 @@ from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.scratch import is_part
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.model.version import model_sha256, version
-from terrafusion.twin.sweep.plan import MAX_RUNS, Sweep, SweepPoint
+from terrafusion.twin.sweep.plan import MAX_RUNS, Sweep
 from terrafusion.twin.sweep.rows import Row, columns, run_chunk
 
 SCHEMA = 1
@@ -73,9 +73,9 @@ def run_sweep(
     done = sweep.runs - sum(len(chunks[number]) for number in missing)
     if missing:
         cases = list(sweep.cases())
-        work = [(sweep, number, [cases[run] for run in chunks[number]]) for number in missing]
+        work = {number: (run_chunk, (sweep, [cases[run] for run in chunks[number]])) for number in missing}
         with open_workers(backend, min(jobs, len(missing)), address) as workers:
-            for number, rows in workers.results(_numbered, work):
+            for number, rows in workers.by_key(work):
                 store.write_part(number, rows)
                 done += len(rows)
                 if progress is not None:
@@ -89,10 +89,6 @@ def read_table(out: Path | str) -> Any:
     import pyarrow.parquet as pq
 
     return pq.read_table(Path(out) / RUNS_FILE)
-
-
-def _numbered(sweep: Sweep, number: int, cases: Sequence[SweepPoint]) -> tuple[int, list[Row]]:
-    return number, run_chunk(sweep, cases)
 
 
 class Store:
