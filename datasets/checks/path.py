@@ -92,6 +92,23 @@ def path_by(recording: Recording, source: str) -> MeasuredPath | None:
     return next((path for path in measured_paths(recording) if path.source == source), None)
 
 
+def driven_and_turned(
+    context: CheckContext, *, metric: bool = False
+) -> tuple[Array, Array, Array | None] | None:
+    """Times (N,) s, speed (N,) m/s by the wheels and angle turned (N,) rad, None without a gyro.
+
+    None where the wheels or, if `metric`, their radius are unknown, or where wheels and gyro hardly overlap.
+    """
+    driven, yaw = motion.wheel_speed(context, metric=metric), motion.gyro_angle(context.recording)
+    if driven is None:
+        return None
+    t, v = driven
+    if yaw is not None:
+        within = (t >= yaw.t_s[0]) & (t <= yaw.t_s[-1])
+        t, v = t[within], v[within]
+    return (t, v, None if yaw is None else np.interp(t, yaw.t_s, yaw.value)) if len(t) >= 10 else None
+
+
 def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, Array, Complex] | None:
     """The path by wheels and gyro z; straight without a gyro.
 
@@ -103,18 +120,11 @@ def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, 
         Times (N,) s since the start, distance rolled (N,) m, and positions (N,) m, east + i north, of
         a robot that starts eastwards; None where wheels or their radius are unknown.
     """
-    driven, yaw = motion.wheel_speed(context, metric=True), motion.gyro_angle(context.recording)
+    driven = driven_and_turned(context, metric=True)
     if driven is None:
         return None
-    t, v = driven
-    heading = np.zeros(len(t))
-    if yaw is not None:
-        within = (t >= yaw.t_s[0]) & (t <= yaw.t_s[-1])
-        t, v = t[within], v[within]
-        heading = np.interp(t, yaw.t_s, yaw.value)
-    if len(t) < 10:
-        return None
-    ahead = np.exp(1j * heading)
+    t, v, turned = driven
+    ahead = np.exp(1j * (np.zeros(len(t)) if turned is None else turned))
     return t, motion.cumulative(t, v, unsigned=True), motion.cumulative(t, v * ahead) + point_m * ahead
 
 

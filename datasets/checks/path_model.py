@@ -13,8 +13,8 @@ import numpy as np
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.checks.motion import cumulative, gyro_angle, wheel_speed
-from terrafusion.datasets.checks.path import MeasuredPath
+from terrafusion.datasets.checks.motion import cumulative
+from terrafusion.datasets.checks.path import MeasuredPath, driven_and_turned
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import resampled_rows
 
@@ -129,17 +129,13 @@ def _contributing(information: Array) -> float:
 def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
     from scipy.ndimage import median_filter
 
-    driven, yaw = wheel_speed(context), gyro_angle(context.recording)
-    if driven is None or yaw is None:
+    driven = driven_and_turned(context)
+    if driven is None:
         return None
-    t, v = driven
-    within = (t >= yaw.t_s[0]) & (t <= yaw.t_s[-1])
-    t, v = t[within], v[within]
-    if len(t) < 10:
-        return None
+    t, v, turned = driven
     inside = (measured.t_s >= t[0] + LONGEST_S) & (measured.t_s <= t[-1] - LONGEST_S)
     t_fix, place = measured.t_s[inside], measured.place[inside]
-    if len(t_fix) < LEAST_WINDOWS * LEAST_ROWS:
+    if turned is None or len(t_fix) < LEAST_WINDOWS * LEAST_ROWS:
         return None
     stride = max(1, int(1.0 / (MOST_HZ * max(float(np.median(np.diff(t_fix))), 1e-3))))
     t_fix, place = t_fix[::stride], place[::stride]
@@ -156,7 +152,6 @@ def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
     ]
     if np.median(np.diff(t)) < SPIKES_S:
         v = median_filter(v, 3)
-    turned = np.interp(t, yaw.t_s, yaw.value)
     return _Windows(t, v, turned, t_fix, place, rows) if len(rows) >= LEAST_WINDOWS else None
 
 

@@ -91,36 +91,25 @@ class _Walk:
         for name, (kind, desc) in self.types[msgtype]:
             inner = f"{path}.{name}" if path else name
             if kind.name in ("BASE", "NAME"):
-                self.one(inner, (kind, desc), depth)
+                self.field(inner, (kind, desc), None, depth)
             else:
-                count = desc[1] if kind.name == "ARRAY" else self.length()
-                self.many(inner, desc[0], count, depth)
+                self.field(inner, desc[0], desc[1] if kind.name == "ARRAY" else self.length(), depth)
 
-    def one(self, path: str, kind_desc: tuple[Any, Any], depth: int) -> None:
-        kind, desc = kind_desc
-        if kind.name == "NAME":
-            self.message(path, desc, depth + 1)
-        elif desc[0] == "string":
-            place = self.string()
-            if self.wants(path):
-                self.words[path] = (place,), False
-        else:
-            self.array(path, desc[0], None)
-
-    def many(self, path: str, kind_desc: tuple[Any, Any], count: int, depth: int) -> None:
+    def field(self, path: str, kind_desc: tuple[Any, Any], count: int | None, depth: int) -> None:
+        """One value (count None) or a list of them: numbers, strings or messages."""
         kind, desc = kind_desc
         if kind.name == "BASE" and desc[0] != "string":
             self.array(path, desc[0], count)
             return
-        if count > len(self.raw) - self.position:
+        if count is not None and count > len(self.raw) - self.position:
             raise BagError(f"a sequence claims {count} entries")
-        if kind.name == "BASE":
-            places = tuple(self.string() for _ in range(count))
-            if self.wants(path):
-                self.words[path] = places, True
+        if kind.name == "NAME":
+            for inner in [path] if count is None else [f"{path}.{i}" for i in range(count)]:
+                self.message(inner, desc, depth + 1)
             return
-        for i in range(count):
-            self.message(f"{path}.{i}", desc, depth + 1)
+        places = tuple(self.string() for _ in range(1 if count is None else count))
+        if self.wants(path):
+            self.words[path] = places, count is not None
 
     def array(self, path: str, base: str, count: int | None) -> None:
         """A number (count None) or an array of numbers."""

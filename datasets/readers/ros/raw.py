@@ -20,6 +20,13 @@ Places = NDArray[np.int64]
 
 Groups = Sequence[Collection[int]]
 """Ids of sources whose messages are wanted together."""
+ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+"""Python's own module, before 3.14 its backport, which rosbags brings."""
+DECODERS = {
+    "lz4": ("lz4.frame", "LZ4FrameDecompressor"),
+    "bz2": ("bz2", "BZ2Decompressor"),
+    "zstd": (ZSTD, "ZstdDecompressor"),
+}
 
 
 class BagError(Exception):
@@ -143,15 +150,12 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 
 def _decoder(compression: str) -> Any:
-    if compression == "lz4":
-        return import_module("lz4.frame").LZ4FrameDecompressor()
-    if compression == "bz2":
-        return import_module("bz2").BZ2Decompressor()
-    if compression == "zstd":
-        return zstd().ZstdDecompressor()
-    raise BagError(f"chunks are compressed by '{compression[:20]}', which is not supported")
+    if compression not in DECODERS:
+        raise BagError(f"chunks are compressed by '{compression[:20]}', which is not supported")
+    module, name = DECODERS[compression]
+    return getattr(import_module(module), name)()
 
 
 def zstd() -> Any:
-    """The zstd module: Python's own from 3.14 on, before that its backport, which rosbags brings."""
-    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    """The zstd module."""
+    return import_module(ZSTD)

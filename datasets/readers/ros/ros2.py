@@ -63,8 +63,7 @@ class Ros2Folder:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._files: list[BagContainer] = []
-        self._ids: list[dict[int, int]] = []
+        self._files: list[tuple[BagContainer, dict[int, int]]] = []  # and the ids here by those of the file
         self._scratch = ExitStack()
         self.sources: list[BagSource] = []
         metadata = _metadata(folder / "metadata.yaml")
@@ -91,27 +90,14 @@ class Ros2Folder:
             raise
 
     def close(self) -> None:
-        for file in self._files:
+        for file, _ in self._files:
             file.close()
         self._scratch.close()
 
     def _add(self, file: BagContainer) -> None:
-        self._files.append(file)
-        ids: dict[int, int] = {}
-        for source in file.sources:
-            same = [
-                s
-                for s in self.sources
-                if (s.topic, s.msgtype, s.definition) == (source.topic, source.msgtype, source.definition)
-            ]
-            if same:
-                merged = dataclasses.replace(same[0], count=same[0].count + source.count)
-                self.sources[merged.id] = merged
-                ids[source.id] = merged.id
-            else:
-                ids[source.id] = len(self.sources)
-                self.sources.append(dataclasses.replace(source, id=len(self.sources)))
-        self._ids.append(ids)
+        ids = {source.id: len(self.sources) + k for k, source in enumerate(file.sources)}
+        self.sources += [dataclasses.replace(source, id=ids[source.id]) for source in file.sources]
+        self._files.append((file, ids))
 
     def _unpacked(self, path: Path) -> Path:
         """A file without its zstd compression, in a scratch folder."""
@@ -124,7 +110,7 @@ class Ros2Folder:
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources, file by file."""
-        for file, ids in zip(self._files, self._ids, strict=True):
+        for file, ids in self._files:
             mine = [[own for own, number in ids.items() if number in group] for group in wanted]
             here = [group for group, own in enumerate(mine) if own]
             for batch in file.batches([mine[group] for group in here]) if here else ():
