@@ -23,6 +23,7 @@ from terrafusion.datasets.checks.path import (
 )
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.checks.sensor_pairs import far_lag, near_lag
+from terrafusion.datasets.checks.signals import MEASURED
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
@@ -318,16 +319,8 @@ def _held(contexts: Sequence[CheckContext]) -> dict[str, UpdateRate]:
 
 
 def _measured(recording: Recording) -> Iterator[tuple[str, TimesNs, Array]]:
-    """Times and measured values by channel, without the command, which may be constant."""
-    wheels, imu, gnss, motor = recording.wheels, recording.imu, recording.gnss, recording.motor
-    if wheels is not None:
-        yield "wheels", wheels.t_ns, wheels.speed
-    if imu is not None:
-        yield "imu", imu.t_ns, np.hstack([imu.gyro_radps, imu.accel_mps2])
-    if gnss is not None:
-        yield "gnss", gnss.t_ns, gnss.enu_m
-    if motor is not None:
-        yield "motor", motor.t_ns, motor.current_a
-    truth = recording.truth
-    if truth is not None:
-        yield "truth", truth.t_ns, truth.position_m
+    """Times and measured values by channel."""
+    for name, fields in MEASURED.items():
+        channel = getattr(recording, name)
+        if channel is not None:
+            yield name, channel.t_ns, np.hstack([getattr(channel, field) for field in fields])

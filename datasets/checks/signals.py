@@ -24,6 +24,14 @@ from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.paired_sides import sampled_apart
 from terrafusion.datasets.core.recording import Recording
 
+MEASURED = {
+    "wheels": ("speed",),
+    "imu": ("gyro_radps", "accel_mps2"),
+    "gnss": ("enu_m",),
+    "motor": ("current_a",),
+    "truth": ("position_m",),
+}
+"""Fields (N, k) with what a channel measured; a command may be constant."""
 HELD_SHARE, LEAST_UPDATES = 0.5, 10
 STUCK_S, STUCK_ZERO_S, STUCK_ROWS = 2.0, 5.0, 20
 """A value that stays for this time, and this many updates, is stuck; wheels may stand for a while."""
@@ -93,13 +101,8 @@ def _true_rows(rows: int, channel: Channel) -> Channel:
 
 def _measured(channel: Channel) -> Array:
     """What a channel measured (N, k), without the axes that it lacks; (N, 0) for other channels."""
-    values = np.zeros((len(channel), 0))
-    if isinstance(channel, Imu):
-        values = np.hstack([channel.gyro_radps, channel.accel_mps2])
-    elif isinstance(channel, Wheels):
-        values = channel.speed
-    elif channel.name == "gnss":
-        values = getattr(channel, "enu_m", values)
+    fields = MEASURED[channel.name] if channel.name in ("imu", "wheels", "gnss") else ()
+    values = np.hstack([np.zeros((len(channel), 0)), *(getattr(channel, field) for field in fields)])
     return np.asarray(values[:, np.isfinite(values).any(axis=0)])
 
 
