@@ -1,8 +1,6 @@
 """Tables with the columns of the log folder -> channels of a recording."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,21 +79,16 @@ COLUMNS = {
 """Of the log folder, by channel."""
 
 
-class TableSource(Protocol):
-    """Where the tables come from."""
-
-    def table(self, channel: str) -> CsvTable | None:
-        """The table of a channel with columns of `COLUMNS`, None where there is none."""
-
-    def place(self, channel: str) -> Path:
-        """The file the channel is in, for messages."""
-
-
 class ChannelReader:
-    """Makes channels of tables; `notes` collects what was assumed or left out."""
+    """Makes channels of tables; `notes` collects what was assumed or left out.
 
-    def __init__(self, source: TableSource, meta: Meta, layouts: Layouts = WHEEL_LAYOUTS) -> None:
-        self.source = source
+    `tables` gives the table of a channel with columns of `COLUMNS`, None where there is none.
+    """
+
+    def __init__(
+        self, tables: Callable[[str], CsvTable | None], meta: Meta, layouts: Layouts = WHEEL_LAYOUTS
+    ) -> None:
+        self.tables = tables
         self.meta = meta
         self.layouts = layouts
         self.notes: list[str] = list(meta.remarks)
@@ -113,7 +106,7 @@ class ChannelReader:
         present = [c for c in columns if c in table.numbers]
         missing = [c for c in columns if c not in table.numbers]
         if present and missing:
-            raise self._error("wheels", f"column '{missing[0]}' is missing beside '{present[0]}'", "add it")
+            raise DataError(f"column '{missing[0]}' is missing beside '{present[0]}'", remedy="add it")
         speed = table.stack([f"{n}_{unit}" for n in names])
         wheels = Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
         if self.meta.keep_empty or not sampled_apart(wheels):
@@ -130,18 +123,18 @@ class ChannelReader:
                 stray = set(table.numbers) - set(speeds) - {f"{n}_rad" for n in names}
                 if stray:
                     what = f"column '{min(stray)}' has no speed beside it"
-                    raise self._error("wheels", what, "remove it or add the speed")
+                    raise DataError(what, remedy="remove it or add the speed")
                 return names, unit
         layouts = " | ".join(", ".join(f"{n}_{unit}" for n in names) for names, unit in self.layouts)
         what = f"columns {', '.join(speeds) or '(none)'} are not a layout"
-        raise self._error("wheels", what, f"give one of: {layouts}")
+        raise DataError(what, remedy=f"give one of: {layouts}")
 
     def imu(self) -> Imu | None:
         table = self._table("imu")
         if table is None:
             return None
         if not table.numbers:
-            raise self._error("imu", "no column beside t_s", f"give any of {', '.join([*GYRO, *ACCEL])}")
+            raise DataError("no column beside t_s", remedy=f"give any of {', '.join([*GYRO, *ACCEL])}")
         return Imu(self._t(table), table.stack(GYRO), table.stack(ACCEL))
 
     def gnss(self) -> Gnss | None:
@@ -150,10 +143,10 @@ class ChannelReader:
             return None
         has = table.numbers.__contains__
         if has("up_m") != has("sigma_u_m"):
-            raise self._error("gnss", "up_m and sigma_u_m must come together", "add the missing one")
+            raise DataError("up_m and sigma_u_m must come together", remedy="add the missing one")
         if has("v_e_mps") != has("v_n_mps") or (has("v_u_mps") and not has("v_e_mps")):
             remedy = "give v_e_mps and v_n_mps, or no velocity column"
-            raise self._error("gnss", "the velocity is incomplete", remedy)
+            raise DataError("the velocity is incomplete", remedy=remedy)
         return Gnss(
             self._t(table),
             table.stack(("east_m", "north_m", "up_m")),
@@ -173,7 +166,7 @@ class ChannelReader:
             if word not in codes:
                 row = int(np.flatnonzero(inverse == k)[0])
                 remedy = f"give one of {', '.join(fix.name.lower() for fix in Fix)}"
-                raise self._row_error("gnss", table, row, f"column 'fix' is '{shown(word)}'", remedy)
+                raise _row_error(table, row, f"column 'fix' is '{shown(word)}'", remedy)
         unknown = int((table.texts["fix"] == "").sum())
         if unknown:
             self.notes.append(f"gnss: {unknown} rows have no fix class; taken as 'single'")
@@ -185,7 +178,7 @@ class ChannelReader:
             return None
         voltages = [name for name in VOLTAGES if name in table.numbers]
         if len(voltages) == 1:
-            raise self._error("motor", f"'{voltages[0]}' comes alone", "give both voltages or none")
+            raise DataError(f"'{voltages[0]}' comes alone", remedy="give both voltages or none")
         return Motor(self._t(table), table.stack(CURRENTS), table.stack(VOLTAGES) if voltages else None)
 
     def terrain(self) -> Terrain | None:
@@ -209,7 +202,7 @@ class ChannelReader:
             if sorted(table.numbers) == sorted(layout):
                 return Steering(self._t(table), table.stack(layout), names)
         what = f"columns {', '.join(table.numbers) or '(none)'} are not a layout"
-        raise self._error("steering", what, f"give one of: {' | '.join(map(', '.join, layouts))}")
+        raise DataError(what, remedy=f"give one of: {' | '.join(map(', '.join, layouts))}")
 
     def barometer(self) -> Barometer | None:
         table = self._table("barometer")
@@ -233,7 +226,7 @@ class ChannelReader:
             position = table.stack(("x_m", "y_m", "z_m"))
             return Trajectory(self._t(table), position, quaternion, twist, self._covariance(table))
         except DataError as error:
-            raise self._error("truth", error.what, error.remedy or "", time_s=error.time_s) from None
+            raise DataError(error.what, time_s=error.time_s, remedy=error.remedy) from None
 
     def _quaternion(self, table: CsvTable) -> Array | None:
         present = [name for name in QUATERNION if name in table.numbers]
@@ -241,13 +234,13 @@ class ChannelReader:
             return None
         if len(present) < 4:
             what = f"only {', '.join(present)} of the quaternion"
-            raise self._error("truth", what, "give qx, qy, qz and qw, or none")
+            raise DataError(what, remedy="give qx, qy, qz and qw, or none")
         q = table.stack(QUATERNION)
         norm = np.linalg.norm(q, axis=1)
         off = np.flatnonzero(np.abs(norm - 1.0) > 0.01)
         if off.size:
             what = f"the quaternion has norm {norm[off[0]]:.3g}"
-            raise self._row_error("truth", table, int(off[0]), what, "give unit quaternions x, y, z, w")
+            raise _row_error(table, int(off[0]), what, "give unit quaternions x, y, z, w")
         return q
 
     def _covariance(self, table: CsvTable) -> Array | None:
@@ -258,7 +251,7 @@ class ChannelReader:
         out = np.empty((len(table.t_ns), 6, 6))
         for name, (i, j) in COVARIANCE.items():
             if i <= j and name not in table.numbers:
-                raise self._error("truth", f"column '{name}' is missing beside '{present[0]}'", "add it")
+                raise DataError(f"column '{name}' is missing beside '{present[0]}'", remedy="add it")
             mirrored = f"cov_{_POSE[j]}_{_POSE[i]}"
             out[:, i, j] = table.numbers[name if name in table.numbers else mirrored]
         return out
@@ -271,7 +264,7 @@ class ChannelReader:
 
         `required` columns are those of `COLUMNS` unless given.
         """
-        table = self.source.table(channel)
+        table = self.tables(channel)
         if table is None:
             return None
         self.notes.extend(table.notes)
@@ -279,7 +272,7 @@ class ChannelReader:
         missing = [name for name in required if name not in table.numbers and name not in table.texts]
         if missing:
             what = f"column '{missing[0]}' is missing"
-            raise self._error(channel, what, f"needed: t_s, {', '.join(required)}")
+            raise DataError(what, remedy=f"needed: t_s, {', '.join(required)}")
         return table if self.meta.keep_empty else self._with_values(channel, table)
 
     def _with_values(self, channel: str, table: CsvTable) -> CsvTable | None:
@@ -290,17 +283,14 @@ class ChannelReader:
         if empty:
             self.notes.append(f"{channel}: {empty} of {len(held)} rows hold no value and were left out")
         if not held.any() and (table.numbers or table.texts):
-            name = self.source.place(channel).name
-            self.notes.append(f"{channel}: {name} holds no sample; the channel is absent")
+            self.notes.append(f"{channel}: {table.file} holds no sample; the channel is absent")
             return None
         return table.select(held) if empty else table
 
-    def _error(self, channel: str, what: str, remedy: str, *, time_s: float | None = None) -> DataError:
-        return DataError(what, file=self.source.place(channel), time_s=time_s, remedy=remedy)
 
-    def _row_error(self, channel: str, table: CsvTable, row: int, what: str, remedy: str) -> DataError:
-        time_s = float(table.t_ns[row]) * 1e-9
-        return self._error(channel, f"{what} at data row {row + 1}", remedy, time_s=time_s)
+def _row_error(table: CsvTable, row: int, what: str, remedy: str) -> DataError:
+    time_s = float(table.t_ns[row]) * 1e-9
+    return DataError(f"{what} at data row {row + 1}", time_s=time_s, remedy=remedy)
 
 
 def rows_with_values(numbers: Mapping[str, Array], n: int) -> Mask:

@@ -41,12 +41,14 @@ class CsvTable(Columns):
 
     Attributes:
         t_ns: (N,) int64, from the start of the recording, never decreasing unless asked for otherwise.
+        file: name of the file, for notes.
         numbers: (N,) float columns by name; an empty cell is NaN.
         texts: (N,) object columns by name; an empty cell is "".
         notes: what was odd about the file, in sentences.
     """
 
     t_ns: TimesNs
+    file: str
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -82,7 +84,7 @@ def _read(path: Path, known: ChannelColumns, in_order: bool) -> CsvTable:
     t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
     _check_times(t_ns, in_order=in_order)
     texts = {name: table.texts[name] for name in words}
-    return CsvTable(t_ns=t_ns, numbers=table.numbers, texts=texts, notes=table.notes)
+    return CsvTable(t_ns=t_ns, numbers=table.numbers, texts=texts, file=path.name, notes=table.notes)
 
 
 def _header(data: bytes, known: ChannelColumns) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import repair_together, sorting
-from terrafusion.datasets.core.errors import ClockError, DataError
+from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
@@ -44,8 +44,8 @@ def read(request: Request) -> list[Recording]:
 def _with_clock_repaired(folder: Path) -> Recording:
     """Read a log folder whose times run backwards somewhere."""
     files = _Folder(folder)
-    paths = {channel: files.place(channel) for channel in CHANNELS}
-    times = {channel: read_times(path) for channel, path in paths.items() if path.is_file()}
+    paths = {channel: files.path(channel) for channel in CHANNELS}
+    times = {channel: read_times(path) for channel, path in paths.items() if path is not None}
     clocks, jumps = repair_together(times)
     recording = read_log_folder(folder, clocks)
     moved = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + recording.start_ns) for jump in jumps)
@@ -76,8 +76,10 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
     source = _Folder(folder, clocks)
-    reader = ChannelReader(source, meta)
-    channels = {name: getattr(reader, name)() for name in CHANNELS}
+    reader, channels = ChannelReader(source.table, meta), {}
+    for name in CHANNELS:
+        with errors_of(source.path(name) or folder):
+            channels[name] = getattr(reader, name)()
     if not any(channel is not None and len(channel) for channel in channels.values()):
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
@@ -121,7 +123,7 @@ class _Folder:
         self.notes: list[str] = []
 
     def table(self, channel: str) -> CsvTable | None:
-        path = self._path(channel)
+        path = self.path(channel)
         if path is None:
             return None
         if channel not in self.clocks:
@@ -134,10 +136,8 @@ class _Folder:
         self.notes.append(late[1])
         return table.select(late[0])
 
-    def place(self, channel: str) -> Path:
-        return self._path(channel) or self.folder
-
-    def _path(self, channel: str) -> Path | None:
+    def path(self, channel: str) -> Path | None:
+        """The file of a channel, None where there is none."""
         plain, packed = self.folder / f"{channel}.csv", self.folder / f"{channel}.csv.gz"
         if plain.exists() and packed.exists():
             raise DataError(

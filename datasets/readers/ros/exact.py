@@ -93,7 +93,7 @@ def restore(
     }
     found = read(asked)
     streams = {name: found[key] for name, key in keys.items() if key in there}
-    tables = ChannelReader(_BagTables(saved, file, streams), saved.meta, LAYOUTS)
+    tables = ChannelReader(_BagTables(saved, file, streams).table, saved.meta, LAYOUTS)
     builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {})
     channels = {
         name: getattr(tables, name)()
@@ -143,9 +143,6 @@ class _BagTables:
         self.file = file
         self.streams = streams
 
-    def place(self, channel: str) -> Path:
-        return self.file
-
     def table(self, channel: str) -> CsvTable | None:
         columns, known = self.saved.tables[channel], COLUMNS[channel]
         names = {*known.numbers, *known.texts} | ({*wheel_columns(LAYOUTS)} if channel == "wheels" else set())
@@ -168,7 +165,7 @@ class _BagTables:
         words = {
             name: self._words(channel, name, numbers.pop(name)) for name in known.texts if name in numbers
         }
-        return CsvTable(t_ns=t_ns, numbers=numbers, texts=words)
+        return CsvTable(t_ns=t_ns, file=self.file.name, numbers=numbers, texts=words)
 
     def _words(self, channel: str, column: str, codes: NDArray[np.float64]) -> NDArray[Any]:
         words = self.saved.words.get(column, [])

@@ -164,9 +164,6 @@ class _Source:
         self.path, self.columns, self.found, self.times = path, columns, column_map, times
         self.t_ns = times.t_ns - start_ns
 
-    def place(self, channel: str) -> Path:
-        return self.path
-
     def table(self, channel: str) -> CsvTable | None:
         fields = self.found.channels.get(channel, {})
         if not fields:
@@ -179,7 +176,7 @@ class _Source:
             numbers |= dict(
                 zip(QUATERNION, rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)).T, strict=True)
             )
-        return CsvTable(t_ns=self.t_ns, numbers=numbers, texts=words)
+        return CsvTable(t_ns=self.t_ns, file=self.path.name, numbers=numbers, texts=words)
 
     def _numbers(self, name: str, of: MappedColumn) -> Array:
         values = self.columns.numbers(of.column)[self.times.order]
@@ -215,7 +212,7 @@ class _Reader(ChannelReader):
     """Channels of a table; a GNSS channel may be in latitude and longitude, and without sigmas."""
 
     def __init__(self, source: _Source, meta: Any, request: Request) -> None:
-        super().__init__(source, meta)
+        super().__init__(source.table, meta)
         self.request = request
         self.datum: Datum | None = meta.datum
 
