@@ -1,10 +1,11 @@
 """Estimates friction with a bank of models, each scored against the displacement between GNSS fixes.
 
-Without an accelerometer only the wheels measure speed, and on ice they are wrong: friction limits how fast
-the robot follows them. `FrictionEstimator` propagates a velocity for each of `FRICTION_MPS2` from wheels
-and gyro (`graph.coulomb`), compares the paths with fixes a second apart and weighs the models by their
-likelihood (multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). The planar graph then takes
-displacement and acceleration from the friction model instead of the wheels.
+Wheels on ice measure the wrong speed: friction limits how fast the robot follows them.
+`FrictionEstimator` propagates a velocity for each of `FRICTION_MPS2` from wheels and gyro
+(`graph.coulomb`), compares the paths with fixes a second apart and weighs the models by their likelihood
+(multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). The graph then takes displacement and
+horizontal acceleration from the friction model instead of wheels and accelerometer: after seconds its limit
+is better known than tilt and bias.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
@@ -37,8 +39,9 @@ SLIPPERY_MPS2 = 2.0
 """Limit (ice, wet or snowy ground) up to which friction may lead; above it wheels do nearly as well."""
 SLIPPERY = FRICTION_MPS2[FRICTION_MPS2 <= SLIPPERY_MPS2]
 LEAD_PROBABILITY = 0.9999
-"""Probability of friction, at any limit, from which it leads on dry ground too: other causes of a bent path
-(soft ground, a hill, a jump of fixes) resemble friction sooner than rolling. Chosen on field logs."""
+"""Probability of friction, at any limit, from which it leads on dry ground too, without an accelerometer:
+other causes of a bent path (soft ground, a hill, a jump of fixes) resemble friction sooner than rolling.
+Chosen on field logs."""
 PRIOR_MPS2, PRIOR_SPREAD = 1.0, 0.7
 """Median friction limit of a skidding robot before any fix, and standard deviation of its logarithm
 (assumed)."""
@@ -69,13 +72,19 @@ class FrictionEstimator:
 
     Args:
         rig: track of the wheels and lever arm of the receiver.
-        preintegrator: makes the planar link.
+        preintegrator: makes the link between keyframes.
         report: called with every change.
+        planar: there is no accelerometer.
     """
 
     def __init__(
-        self, rig: Rig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
+        self,
+        rig: Rig,
+        preintegrator: Preintegrator,
+        report: Callable[[WeightChange], None],
+        planar: bool = True,
     ) -> None:
+        self._planar = planar
         self.track_m = rig.track_m
         self.antenna_m = np.array(rig.sensors.gnss.antenna_m)
         self._preintegrator = preintegrator
@@ -108,7 +117,8 @@ class FrictionEstimator:
         weight = self.probabilities()
         if float(weight[: len(SLIPPERY)].sum()) > 0.5:
             return slice(len(SLIPPERY))
-        return slice(len(FRICTION_MPS2)) if float(weight[:-1].sum()) > LEAD_PROBABILITY else None
+        certain = self._planar and float(weight[:-1].sum()) > LEAD_PROBABILITY
+        return slice(len(FRICTION_MPS2)) if certain else None
 
     @property
     def mps2(self) -> float:
@@ -182,7 +192,7 @@ class FrictionEstimator:
 
         Args:
             t_ns, dt_s: end and length of the keyframe interval.
-            segments: of the gyro, with the specific force of a rolling robot.
+            segments: of the IMU; in a planar graph with the specific force of a rolling robot.
             wheels: as they rolled; None where samples are missing.
             before: state at the start.
             covariance: (dim, dim) of it.
@@ -269,6 +279,9 @@ class FrictionEstimator:
         force = (_rotation(half) @ ends[0] - _rotation(-half) @ start) / dt_s
         free = np.clip(1.0 - np.diag(kept), 0.0, 1.0)
         skidding = math.sqrt(SKID_DENSITY_MPS2**2 + spread**2 * SKID_S + _density2(skid_m2ps))
+        if not self._planar:
+            # What an accelerometer would read: gravity along the tilted axes, and its bias.
+            force = force + GRAVITY_MPS2 * R[2, :2] + before.bias.accelerometer()[:2]
         density = np.minimum(np.hypot((1.0 - free) * skidding, free * ACCEL_DENSITY_MPS2), ACCEL_DENSITY_MPS2)
         segments = [
             dataclasses.replace(
@@ -309,12 +322,11 @@ class FrictionEstimator:
 def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
 ) -> FrictionEstimator | None:
-    """The friction estimator; None unless planar with gyro and both sides, and adaptive."""
+    """The friction estimator; None unless adaptive, with gyro and both sides."""
     inputs = config.inputs
-    usable = inputs.planar and inputs.sides and inputs.yaw == "gyro" and not config.calibrate
-    return (
-        FrictionEstimator(config.rig, preintegrator, report) if usable and config.mode == "adaptive" else None
-    )
+    if config.mode != "adaptive" or config.calibrate or not (inputs.sides and inputs.yaw == "gyro"):
+        return None
+    return FrictionEstimator(config.rig, preintegrator, report, inputs.planar)
 
 
 def _density2(rate_m2ps: float) -> float:
