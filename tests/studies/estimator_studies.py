@@ -123,6 +123,20 @@ ESTIMATOR = (
         spread=True,
     ),
     Study(
+        "unseen_slick",
+        "What do adaptive weights gain on slick ground, on robots that no part of the library made?",
+        module("unseen_robots.study", "--out", OUT, "--slick", "--seconds", "30"),
+        15,
+        {
+            "adaptive_over_fixed": r"adaptive over fixed, 30 s: ([\d.]+ \[[\d.]+, [\d.]+\])",
+            "worst": r"adaptive over fixed, 30 s: .* worst ([\d.]+)",
+            "adaptive_over_ekf": r"adaptive over EKF, 30 s: ([\d.]+ \[[\d.]+, [\d.]+\])",
+            "fixed_inside": r"fixed over EKF, 30 s: .* ellipses (\d+ %)",
+            "adaptive_inside": r"adaptive over EKF, 30 s: .* ellipses (\d+ %)",
+        },
+        spread=True,
+    ),
+    Study(
         "coarse_slides",
         "What does watching the receiver's drift gain on ground that slips, with coarse fixes?",
         module("coarse_slides", "--out", OUT),

@@ -1,16 +1,18 @@
 """Errors in outages on robots that no part of the library made, beside a plain EKF.
 
-    python -m tests.studies.unseen_robots.study --out FOLDER [--robots 18] [--first-seed 100]
+    python -m tests.studies.unseen_robots.study --out FOLDER [--robots 18] [--first-seed 100] [--slick]
 
 The robots are rigid bodies in MuJoCo (`machine`), drawn by seed (`draw`): three drive types, unknown antenna,
 turned and tilted IMU, late fixes, three receivers, slick patches. terrafusion gets the log with wheel radius,
 track and drive type, as an owner knows them, and runs with its defaults. What self-calibration says of a
-robot after a drive with all fixes is held against the truth. Seeds below 100 are for development.
+robot after a drive with all fixes is held against the truth. With `--slick` the whole site is as slick as its
+patches, and fixes are RTK. Seeds below 100 are for development.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 from collections.abc import Sequence
@@ -26,7 +28,7 @@ from tests.studies.opponents.drives import vehicle_of
 from tests.studies.opponents.protocol import Row, scored, streams_of
 from tests.studies.opponents.summary import geometric_mean, losses, ratio
 from tests.studies.parts import Task, TaskWorkers, add_options, code_of, library_code, result_of, run_all
-from tests.studies.unseen_robots.draw import Robot, draw
+from tests.studies.unseen_robots.draw import KINDS, Robot, draw
 from tests.studies.unseen_robots.machine import drive
 from tests.studies.unseen_robots.sensors import recording_of
 
@@ -66,15 +68,21 @@ class Learned:
 
 @dataclass(frozen=True)
 class Work:
-    """All estimators on the robot of a seed."""
+    """All estimators on the robot of a seed; with `slick` on slick ground alone, with RTK fixes."""
 
     seed: int
     lengths: tuple[float, ...]
+    slick: bool = False
+
+    def robot(self) -> Robot:
+        """The robot on its site."""
+        robot = draw(self.seed)
+        return dataclasses.replace(robot, slick_share=1.0, receiver=KINDS["rtk"]) if self.slick else robot
 
 
 def compute(work: Work) -> dict[str, list[dict[str, Any]]]:
     """Results and learned numbers of one robot."""
-    robot = draw(work.seed)
+    robot = work.robot()
     recording = recording_of(robot, drive(robot))
     streams = streams_of(recording, vehicle_of(recording, None))
     assert streams is not None
@@ -169,6 +177,12 @@ def table(results: Sequence[Result]) -> list[str]:
             lost = f"lost {losses(pairs)} of {len(pairs)}, worst {max(pairs):.2f}"
             held = f"inside 95 % ellipses {100.0 * float(np.mean(inside)):.0f} %"
             lines.append(f"{mode} over EKF, {seconds:g} s: {geometric_mean(pairs).text()}, {lost}, {held}")
+        robots = [r.robot for r in results if (r.seconds, r.estimator) == (seconds, EKF)]
+        own = [ratio(*(by[robot, seconds, mode].median_m for mode in MODES[::-1])) for robot in robots]
+        lines.append(
+            f"adaptive over fixed, {seconds:g} s: {geometric_mean(own).text()}, worst {max(own):.2f}, "
+            f"best {min(own):.2f}"
+        )
     return lines
 
 
@@ -182,13 +196,15 @@ def main() -> int:
     parser.add_argument("--robots", type=int, default=18)
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--seconds", nargs="+", type=float, default=(10.0, 30.0))
+    parser.add_argument("--slick", action="store_true", help="slick ground alone, with RTK fixes")
     add_options(parser)
     given = parser.parse_args()
     code = library_code() + code_of(
         *(HERE / f"{name}.py" for name in ("draw", "machine", "sensors", "study"))
     )
     seeds = range(given.first_seed, given.first_seed + given.robots)
-    tasks = [Task(f"robot {seed} {given.seconds}", code, Work(seed, tuple(given.seconds))) for seed in seeds]
+    name, lengths = "slick robot" if given.slick else "robot", tuple(given.seconds)
+    tasks = [Task(f"{name} {k} {given.seconds}", code, Work(k, lengths, given.slick)) for k in seeds]
     run_all(tasks, compute, given.out / "parts", TaskWorkers.of(given))
     done = [found for task in tasks if (found := result_of(task, given.out / "parts")) is not None]
     print("\n".join(table([Result(**entry) for found in done for entry in found["results"]])))
