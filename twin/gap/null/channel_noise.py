@@ -15,8 +15,8 @@ from terrafusion.twin.gap.rollout.residuals import (
     RunResiduals,
     initial_state_sigma,
     noise_sigma,
-    projected,
-    whitened_columns,
+    physical_error,
+    whitened,
 )
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
@@ -101,27 +101,15 @@ def _fit_residuals(
 ) -> dict[str, Series]:
     """Residuals of one run after a fit of its states, effects (1 sigma `size`) and poses, in units of the
     data sheets' sigma, by channel and window."""
-    plain = run.without_nuisance()
-    white = whitened_columns(run.log, noise, plain.stacked())
-    evidence = projected(plain, white)
-    prior = np.concatenate([1.0 / sigma**2, np.full(run.by_effect[0].shape[1], size**-2.0)])
-    K = len(prior)
-    fit = np.linalg.solve(evidence.gram[:K, :K] + np.diag(prior), evidence.gram[:K, -1])
-    pose = _best_poses(evidence.window, white[:, -3:], white[:, K] - white[:, :K] @ fit)
-    sigma_of = [noise_sigma(o, noise[o.channel]) for o in run.log.observed]
-    out: dict[str, Series] = {}
-    for i, k, rows in sample_map(run.log).blocks:
+    white = whitened(run.without_nuisance(), noise)
+    prior = np.append(sigma**-2.0, np.full(run.by_effect[0].shape[1], size**-2.0))
+    rows, K = white.rows.astype(float), len(prior)
+    fit = np.linalg.solve(white.gram[:K, :K] + np.diag(prior), white.gram[:K, -1])
+    rest = physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit)
+    out, first = dict[str, Series](), 0
+    for i, _, mine in sample_map(run.log).blocks:
         observed = run.log.observed[i]
-        rest = run.error[i][rows] - run.by_state[i][rows] @ fit[: len(sigma)]
-        rest -= run.by_effect[i][rows] @ fit[len(sigma) :] + run.by_pose[i][rows] @ pose[k]
-        out.setdefault(observed.channel, []).append((observed.slot[rows], rest / sigma_of[i][rows]))
-    return out
-
-
-def _best_poses(window: Indices, columns: Array, error: Array) -> dict[int, Array]:
-    """The pose (3,) of each window that explains most of an error (n,)."""
-    out = {}
-    for k in np.unique(window):
-        mine = columns[window == k]
-        out[int(k)] = np.linalg.solve(1e-6 * np.eye(3) + mine.T @ mine, mine.T @ error[window == k])
+        values = rest[first : first + len(mine)] / noise_sigma(observed, noise[observed.channel])[mine]
+        out.setdefault(observed.channel, []).append((observed.slot[mine], values))
+        first += len(mine)
     return out

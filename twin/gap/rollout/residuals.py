@@ -335,12 +335,8 @@ def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: 
 
 
 def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:
-    """The run in units and axes in which its noise is white."""
-    return projected(run, whitened_columns(run.log, noise, run.stacked()))
-
-
-def projected(run: RunResiduals, white: Array) -> WhitenedRun:
-    """Whitened columns (n, T + P + 4), as `RunResiduals.stacked` has them, with the poses projected out."""
+    """The run in units and axes in which its noise is white, with the poses projected out."""
+    white = whitened_columns(run.log, noise, run.stacked())
     blocks = sample_map(run.log).blocks
     channel = np.concatenate([np.full(len(rows), i) for i, _, rows in blocks])
     window = np.concatenate([np.full(len(rows), k) for _, k, rows in blocks])
