@@ -143,6 +143,17 @@ class _Explainer:
             points += [SimulatedSize(law, x, soils) for x in new]
         return look.bank.with_sizes(self.evidence, points)
 
+    def until_simulated(self, look: _Look, sizes: Mapping[int, list[float]]) -> tuple[_Look, list[Array]]:
+        """The look with a bank that is simulated near the best sizes of some laws, and the coefficients of
+        each law at its best there."""
+        _, _, used = look.laws.best(look.metric)
+        for _ in range(ROUNDS):
+            look = self.look(self.with_best_sizes(look, sizes, used))
+            gains, values, used = look.laws.best(look.metric)
+            _, beside = look.beside(used[max(sizes, key=lambda i: gains[i])])
+            sizes = {i: [float(v[i][0]) for v in (values, beside)[: len(s)]] for i, s in sizes.items()}
+        return look, used
+
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
         basis = np.arange(len(self.evidence.candidates.keys), m.shared - self.robot.misfit)
@@ -197,13 +208,7 @@ def explain(
     alone = own.alone(look)
     # The most promising laws alone, simulated until the best sizes are among those simulated.
     sizes = own.promising(look, alone, FIRST)
-    look = own.look(look.bank.only(look.laws.names[i] for i in sizes))
-    gains, values, used = look.laws.best(look.metric)
-    for _ in range(ROUNDS):
-        look = own.look(own.with_best_sizes(look, sizes, used))
-        gains, values, used = look.laws.best(look.metric)
-        _, beside = look.beside(used[max(sizes, key=lambda i: gains[i])])
-        sizes = {i: [float(v[i][0]) for v in (values, beside)[: len(some)]] for i, some in sizes.items()}
+    look, used = own.until_simulated(own.look(look.bank.only(look.laws.names[i] for i in sizes)), sizes)
     # Close look: alone and in pairs, each with the discrepancy of its law.
     runs, extra = products_with_discrepancy(
         evidence.runs, evidence.model, look.bank, {i: used[i] for i in sizes}
