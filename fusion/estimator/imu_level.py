@@ -136,8 +136,11 @@ class ImuLevel:
         roll, pitch = self._seen.angles()
         off = complex(roll.rad, pitch.rad) * cmath.exp(-1j * yaw_rad)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        sigmas = (math.hypot(c * a.sigma_rad, s * b.sigma_rad) for a, b in ((roll, pitch), (pitch, roll)))
-        return Angle(off.real, next(sigmas)), Angle(off.imag, next(sigmas))
+        sigma = (
+            math.hypot(c * roll.sigma_rad, s * pitch.sigma_rad),
+            math.hypot(s * roll.sigma_rad, c * pitch.sigma_rad),
+        )
+        return Angle(off.real, sigma[0]), Angle(off.imag, sigma[1])
 
     def _in_use(self, i: int, before: Angle, found: Angle) -> Angle:
         """What was found where that is clear, else what was known before, its sigma with the difference."""

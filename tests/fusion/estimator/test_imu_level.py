@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
@@ -37,13 +38,17 @@ def drive(slope_deg: float) -> Recording:
     return simulate(laps, seed=3)
 
 
-@pytest.fixture(scope="module")
-def tilted() -> Recording:
-    run = drive(6.0)
+def mounted(run: Recording, yaw_rad: float) -> Recording:
+    """The drive as a tilted IMU measures it."""
     assert run.imu is not None
-    R = gtsam.Rot3.RzRyRx(ROLL, PITCH, 0.0).matrix()  # turns its readings into body axes
+    R = gtsam.Rot3.RzRyRx(ROLL, PITCH, yaw_rad).matrix()  # turns its readings into body axes
     imu = dataclasses.replace(run.imu, gyro_radps=run.imu.gyro_radps @ R, accel_mps2=run.imu.accel_mps2 @ R)
     return dataclasses.replace(run, imu=imu)
+
+
+@pytest.fixture(scope="module")
+def tilted() -> Recording:
+    return mounted(drive(6.0), 0.0)
 
 
 def level(result: ReplayResult) -> tuple[NumberAfterDrive, NumberAfterDrive]:
@@ -73,6 +78,18 @@ def test_a_tilted_imu_is_found_and_levelled(tilted: Recording) -> None:
     assert off_level_deg(found, 75.0).max() < 1.0
     (note,) = (note for note in found.estimate.notes if "the IMU is tilted" in note)
     assert "calibrate LOG --sensors" in note
+
+
+def test_the_tilt_of_an_imu_that_points_backwards_is_found_by_its_own_axes() -> None:
+    yaw_rad, robot = math.radians(-150.0), load_vehicle("elevate")
+    known = dataclasses.replace(robot.robot, imu_yaw_rad=KnownNumber(yaw_rad, "measured", 0.02))
+    found = replay(
+        mounted(drive(0.0), yaw_rad), mode="fixed", vehicle=dataclasses.replace(robot, robot=known)
+    )
+    for number, truth in zip(level(found), (ROLL, PITCH), strict=True):
+        assert number.corrects
+        assert abs(number.value - truth) < 3.0 * number.sigma
+    assert off_level_deg(found, 75.0).max() < 1.0
 
 
 def test_a_batch_is_levelled_from_its_start(tilted: Recording) -> None:
