@@ -69,9 +69,13 @@ class MountingTilt:
         self._P[0, 0] = UNKNOWN_M**2
         self._P[0, 1:] = self._P[1:, 0] = 0.0
 
-    def angles(self) -> tuple[Angle, Angle]:
-        """Roll and pitch by all there is; sigma is wider where turns and heights disagree (Birge 1932)."""
-        by_heights, unknown = self.heights, Angle(0.0, WIDE_RAD)
+    def angles(self, ahead_known: bool = True) -> tuple[Angle, Angle]:
+        """Roll and pitch by turns, and by heights where it is known which force is that ahead.
+
+        Sigma is wider where both disagree (Birge 1932).
+        """
+        unknown = Angle(0.0, WIDE_RAD)
+        by_heights = self.heights if ahead_known else unknown
         roll, pitch = self.turns or (unknown, unknown)
         both = pitch.combined(by_heights)
         apart = abs(pitch.rad - by_heights.rad) / math.hypot(pitch.sigma_rad, by_heights.sigma_rad)

@@ -29,6 +29,8 @@ CLEAR_SIGMA, LEAST_RAD, STILL_CLEAR = 4.0, math.radians(1.5), 0.5
 both (assumed)."""
 LEAST_STEP_RAD = math.radians(0.5)
 """What is in use changes by no less."""
+AHEAD_KNOWN_RAD = 0.2
+"""Heights count where the angle about z is known so well (assumed)."""
 DOUBTFUL_RAD, DOUBTFUL_CLIMB_MPS = 0.02, 0.1
 """1 sigma of the body's tilt and of its climb after a correction (assumed)."""
 UP_OVER_LEVEL = 1.5
@@ -100,13 +102,20 @@ class ImuLevel:
             self._new |= self._seen.height(float(fix.enu_m[2]), sigma_m)
 
     def keyframe(
-        self, chain: Chain, dt_s: float, rolled_m: float, gyro_radps: Array, accel_mps2: Array
+        self,
+        chain: Chain,
+        dt_s: float,
+        rolled_m: float,
+        gyro_radps: Array,
+        accel_mps2: Array,
+        yaw_sigma_rad: float,
     ) -> bool:
         """Take the motion over `dt_s` up to the newest keyframe; True when states were turned.
 
         Args:
             rolled_m: mean distance of the wheels.
             gyro_radps, accel_mps2: (3,) mean readings, corrected.
+            yaw_sigma_rad: 1 sigma of the angle of the IMU about z.
         """
         if self._held:
             return False
@@ -118,7 +127,7 @@ class ImuLevel:
             return False
         self._new, yaw = False, self._imu.mounting_rad
         was, used = complex(*self._angles()), []
-        for i, (before, off) in enumerate(zip(self.before, self._found(yaw), strict=True)):
+        for i, (before, off) in enumerate(zip(self.before, self._found(yaw, yaw_sigma_rad), strict=True)):
             found = before.combined(Angle(before.rad + off.rad, off.sigma_rad))
             used.append(self._in_use(i, before, found))
         self.known = used[0], used[1]
@@ -131,9 +140,9 @@ class ImuLevel:
         roll, pitch = self.known
         return roll.rad, pitch.rad
 
-    def _found(self, yaw_rad: float) -> tuple[Angle, Angle]:
+    def _found(self, yaw_rad: float, yaw_sigma_rad: float) -> tuple[Angle, Angle]:
         """Roll and pitch beyond those known before, by the axes in which the file has them."""
-        roll, pitch = self._seen.angles()
+        roll, pitch = self._seen.angles(yaw_sigma_rad < AHEAD_KNOWN_RAD)
         off = complex(roll.rad, pitch.rad) * cmath.exp(-1j * yaw_rad)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         sigma = (

@@ -73,7 +73,7 @@ class ImuMounting:
             self._seen.interrupt()
             self.level.interrupt()
             return False
-        levelled = self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
+        levelled = self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2, self.known.sigma_rad)
         bias = chain.state(chain.last).bias
         turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
         raw = turned(accel_mps2, -self._imu.mounting_rad) if self._imu.mounting_rad else accel_mps2

@@ -83,6 +83,14 @@ def test_heights_tell_pitch_of_a_straight_drive_and_a_slope_is_none() -> None:
             assert abs(tilt.heights.rad - truth) < 3.0 * tilt.heights.sigma_rad
 
 
+def test_heights_count_where_the_axis_ahead_is_known() -> None:
+    tilt = driven(1, 40.0, mounted=TILTED, turning=0.02, height_sigma_m=0.02)
+    assert tilt.turns is None
+    _, pitch = tilt.angles()
+    assert abs(pitch.rad - PITCH) < 3.0 * pitch.sigma_rad < math.radians(3.0)
+    assert tilt.angles(ahead_known=False)[1].sigma_rad > math.radians(10.0)
+
+
 def test_a_bias_of_the_accelerometer_that_its_data_sheet_allows_is_no_tilt() -> None:
     tilt = driven(2, 600.0, turning=0.02, height_sigma_m=3.0, bias_mps2=0.5)
     assert abs(tilt.heights.rad) > math.radians(2.0)
