@@ -99,7 +99,8 @@ class SoilSearch:
             now, before = sum(float(e @ e) for e in white), self.cost()
             if now < before:
                 self.soil, self.errors, self.white_errors = soil, errors, white
-                self.going = ENOUGH * before >= now >= GOOD * sum(map(len, white))
+                near = now > ENOUGH * before or now < GOOD * sum(map(len, white))
+                self.going = len(self.runs) > 1 or not near  # all others build on a soil that runs share
                 return
         self.share *= SHORTER
         self.going = self.share >= LEAST_STEP
