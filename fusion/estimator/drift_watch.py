@@ -7,6 +7,10 @@ the estimate of a Gauss-Markov state d with sigma s and time constant T moves in
     d(t) - a d(0) ,  a = exp(-t / T) ,  covariance  a^2 P(0) + s^2 (1 - a^2) - P(t) ,
 
 with P its covariance (increments of a conditional mean; Gelb 1974, Applied Optimal Estimation, ch. 4.2).
+
+A receiver that reports less than its data sheet may drift as its report or as the sheet says. The moves
+over longer times tell: s^2 follows the mean of their squares over those expected, step by step with falling
+gain (Robbins and Monro 1951, Ann. Math. Stat. 22(3)), and begins at the sheet's.
 """
 
 from __future__ import annotations
@@ -35,28 +39,71 @@ LEAST_SHARE = 0.5
 """Share of the drift state from which fixes show it: those of RTK do not."""
 
 
+LEARNED_S = 10.0
+"""Time over which moves tell of sigma (assumed: much longer than white errors last)."""
+PRIOR_MOVES, MOST_MOVES = 3.0, 30.0
+"""Moves for which the data sheet counts, and those that are remembered (assumed)."""
+LARGEST_MOVE = 4.0
+"""Ratio of a move's square over the expected one from which it counts no more: the robot slid (assumed)."""
+TELLING = 0.1
+"""Least share of a move that the estimate can show."""
+
+
 @dataclass
 class DriftWatch:
     """The newest estimates of the drift.
 
     Attributes:
-        sigma_m, time_s: of the drift's Gauss-Markov process.
+        sigma_m, time_s: of the drift's Gauss-Markov process; sigma as learned.
         fresh: fixes that show the drift came into the graph since the last test.
         seen: time, drift east and north, m, and mean variance of it, m2.
+        sheet_m: sigma by the data sheet, the largest.
     """
 
     sigma_m: float
     time_s: float
     fresh: bool = False
     seen: list[tuple[int, float, float, float]] = field(default_factory=list)
+    sheet_m: float = field(init=False)
+    _far: tuple[int, float, float, float] | None = None
+    _moves: float = 0.0
 
-    def test_wheels(self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise) -> bool:
-        """Refute the wheels where the drift moved too far; True where it did. `sigma_m` is that of a fix."""
+    def __post_init__(self) -> None:
+        self.sheet_m = self.sigma_m
+
+    def learn(self, t_ns: int, drift_m: Array, variance_m2: float, least_m: float) -> None:
+        """Follow the moves of the drift, (2,) m, with sigma between `least_m` and the data sheet's.
+
+        `variance_m2` is that of an axis of the estimate.
+        """
+        east_m, north_m = drift_m.tolist()
+        if self._far is not None:
+            before_ns, e_m, n_m, before_m2 = self._far
+            kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
+            if t_ns - before_ns < LEARNED_S * 1e9:
+                return
+            new_m2 = self.sigma_m**2 * (1.0 - kept**2)
+            expected_m2 = kept**2 * before_m2 + new_m2 - variance_m2
+            if expected_m2 > TELLING * new_m2:
+                square = ((east_m - kept * e_m) ** 2 + (north_m - kept * n_m) ** 2) / (2.0 * expected_m2)
+                self._moves = min(self._moves + 1.0, MOST_MOVES)
+                gain = 1.0 / (PRIOR_MOVES + self._moves)
+                sigma_m = self.sigma_m * math.sqrt(1.0 + gain * (min(square, LARGEST_MOVE) - 1.0))
+                self.sigma_m = min(max(sigma_m, least_m), self.sheet_m)
+        self._far = t_ns, east_m, north_m, variance_m2
+
+    def test_wheels(
+        self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise, least_m: float
+    ) -> bool:
+        """Refute the wheels where the drift moved too far; True where it did. `sigma_m` is that of a fix,
+        `least_m` the drift's by what the fixes report."""
         if not self.fresh:
             return False
         drift_m = np.array(chain.state(chain.last).linear[DRIFT.start - NAV.stop : DRIFT.stop - NAV.stop])
         P = chain.covariance_at(chain.last)
-        moved = self.moved_too_far(chain.nodes[-1].t_ns, drift_m, 0.5 * float(np.trace(P[DRIFT, DRIFT])))
+        t_ns, variance_m2 = chain.nodes[-1].t_ns, 0.5 * float(np.trace(P[DRIFT, DRIFT]))
+        self.learn(t_ns, drift_m, variance_m2, least_m)
+        moved = self.moved_too_far(t_ns, drift_m, variance_m2)
         if moved is None or P[2, 2] > MOST_YAW_RAD**2:
             return False
         since_ns, moved_m = moved
@@ -86,3 +133,4 @@ class DriftWatch:
     def restart(self) -> None:
         """Forget what was seen: the drift state is new."""
         self.seen.clear()
+        self._far = None

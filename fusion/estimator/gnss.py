@@ -41,6 +41,7 @@ UNUSED_WEIGHT = 0.01
 WHITE_SHARE = 0.2
 """Share of a fix's variance that is white; the rest drifts slowly. More where fixes scatter more about the
 dead-reckoned path."""
+SLOW_SIGMA = math.sqrt(1.0 - WHITE_SHARE)
 ALL_NEW = 0.75
 """Estimated share from which all is taken for white: the estimate is off by a tenth or two (assumed)."""
 OPTIMISTIC_SCATTER = 2.0
@@ -97,7 +98,6 @@ class GnssUpdater:
         self._class_scale: dict[Fix | None, float] = {}
         imu = config.rig.sensors.imu
         self._bias_sigma = np.repeat([imu.accel_bias_sigma_mps2, imu.gyro_bias_sigma_radps], 3)
-        self.drift_sigma_m = spec.sigma_horizontal_m * float(np.sqrt(1.0 - WHITE_SHARE))
         self.drift_time_s = max(spec.correlation_time_s, 0.1)
         # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
         # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
@@ -116,8 +116,13 @@ class GnssUpdater:
         self.plausible = FixPlausibility()
         self._report = report
         self._seen = 0
-        self.drift_watch = DriftWatch(self.drift_sigma_m, self.drift_time_s)
-        self._share = 0.0
+        self.drift_watch = DriftWatch(SLOW_SIGMA * spec.sigma_horizontal_m, self.drift_time_s)
+        self._share, self._least_drift_m = 0.0, self.drift_sigma_m
+
+    @property
+    def drift_sigma_m(self) -> float:
+        """1 sigma of the slow errors, each axis."""
+        return self.drift_watch.sigma_m
 
     def queue(self, fix: GnssFix) -> None:
         """Take a fix in, in any order of time."""
@@ -160,7 +165,7 @@ class GnssUpdater:
         keyframe.
         """
         used = False
-        if self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise):
+        if self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise, self._least_drift_m):
             covariance = chain.covariance_at(chain.last)
         self.track.step(chain, self.skid.rate_m2ps > 0.0)
         self.plausible.watch(chain.nodes[-1].t_ns)
@@ -423,9 +428,10 @@ class GnssUpdater:
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
         reported_m = fix.horizontal_sigma_m * inflation
-        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
-        scale = self._class_scale.get(fix.fix, 1.0)
-        return slow * min(scale, OPTIMISM * reported_m / self.sheet_sigma_m)
+        slow = math.sqrt(1.0 - self.white) / SLOW_SIGMA
+        scale = min(self._class_scale.get(fix.fix, 1.0), OPTIMISM * reported_m / self.sheet_sigma_m)
+        self._least_drift_m = SLOW_SIGMA * reported_m / scale
+        return slow * scale
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
         """1 sigma (3,) of the white part of a fix."""

@@ -14,6 +14,8 @@ from tests.studies.opponents.drives import Drive, drives_of, longest
 
 SIGMA_M, TIME_S, WHITE_M, WHEELS_M = 1.34, 60.0, 0.67, 0.1
 """Drift and white noise of a stand-alone receiver of 1.5 m, and what the wheels get wrong in a second."""
+LEAST_M = 0.45
+"""Drift of a receiver that reports half a metre."""
 
 
 def filtered(fixes: Array) -> tuple[Array, Array]:
@@ -55,6 +57,36 @@ def test_a_receiver_that_drifts_as_modelled_is_seldom_suspected() -> None:
 def test_a_slide_of_several_metres_is_seen() -> None:
     rng = np.random.default_rng(2)
     assert sum(alarms(rng, 4.0) > 0 for _ in range(100)) >= 80
+
+
+def learned_m(rng: np.random.Generator, true_m: float, seconds: int = 300) -> float:
+    """Sigma of the drift after a drive, of fixes that report half a metre and drift by `true_m`."""
+    keep, watch = np.exp(-1.0 / TIME_S), DriftWatch(SIGMA_M, TIME_S)
+    x, P, h = np.zeros((2, 2)), np.diag([4.0, SIGMA_M**2]), np.ones(2)
+    drift, off = true_m * rng.normal(size=2), np.zeros(2)
+    for k in range(seconds):
+        drift = keep * drift + true_m * np.sqrt(1.0 - keep**2) * rng.normal(size=2)
+        off = off + WHEELS_M * rng.normal(size=2)
+        F, Q = np.diag([1.0, keep]), np.diag([WHEELS_M**2, watch.sigma_m**2 * (1.0 - keep**2)])
+        x, P = x @ F, F @ P @ F.T + Q
+        gain = P @ h / (h @ P @ h + 0.2**2)
+        left = off + drift + 0.2 * rng.normal(size=2) - x @ h
+        x, P = x + np.outer(left, gain), P - np.outer(gain, h @ P)
+        watch.learn(k * 10**9, x[:, 1], P[1, 1], LEAST_M)
+    return watch.sigma_m
+
+
+def test_a_receiver_better_than_its_sheet_is_found_to_be() -> None:
+    """Drift by the report: a third of the sheet's; one that drifts as the sheet says keeps most of it."""
+    rng = np.random.default_rng(3)
+    assert np.median([learned_m(rng, LEAST_M) for _ in range(20)]) < 0.65 * SIGMA_M
+    usual = [learned_m(rng, SIGMA_M) for _ in range(20)]
+    assert np.median(usual) > 0.85 * SIGMA_M
+    assert max(usual) <= SIGMA_M
+
+
+def test_drift_is_never_less_than_reported() -> None:
+    assert learned_m(np.random.default_rng(4), 0.05, seconds=3000) >= LEAST_M
 
 
 def test_a_new_drift_state_is_not_compared_with_the_old_one() -> None:
