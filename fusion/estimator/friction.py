@@ -226,7 +226,10 @@ class FrictionEstimator:
             self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
             here = np.tile((R @ self.antenna_m)[:2], (len(self._base), 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
-        self._velocity, moved_m = skid_motion(self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s)
+        gravity = self._gravity_mps2(before)
+        self._velocity, moved_m = skid_motion(
+            self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s, gravity
+        )
         rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _lateral_m(wheels, before)]
         moved_m = np.vstack([moved_m, rolled])
         turned = R @ (gtsam.Rot3.Rz(wheels.yaw_rad).matrix() - np.eye(3)) @ self.antenna_m
@@ -243,6 +246,13 @@ class FrictionEstimator:
             why = f"friction: {best} explains the displacement between fixes best"
             self._report(WeightChange(t_ns, "wheels", reported, now, "m/s2", why))
             self._reported_mps2 = now
+
+    def _gravity_mps2(self, before: KeyState) -> tuple[float, float]:
+        """Along body x and y; the ground of a planar graph is level."""
+        if self._planar:
+            return 0.0, 0.0
+        x, y, _ = (-GRAVITY_MPS2 * before.rotation[2]).tolist()
+        return x, y
 
     def _wheel_motion(
         self, wheels: WheelIncrement, before: KeyState, dt_s: float
@@ -271,7 +281,8 @@ class FrictionEstimator:
         start = (R.T @ before.velocity)[:2]
         starts = start + np.array([[0.0, 0.0], [_STEP_MPS, 0.0], [0.0, _STEP_MPS]])
         friction, spread = self._moments()
-        ends, paths = skid_motion(starts, *motion, np.full(3, friction), self.track_m, dt_s)
+        gravity = self._gravity_mps2(before)
+        ends, paths = skid_motion(starts, *motion, np.full(3, friction), self.track_m, dt_s, gravity)
         kept = (ends[1:] - ends[0]).T / _STEP_MPS
         carried_s = (paths[1:] - paths[0]).T / _STEP_MPS
         variance = np.diag(carried_s @ (R.T @ covariance[VELOCITY, VELOCITY] @ R)[:2, :2] @ carried_s.T)
@@ -280,8 +291,8 @@ class FrictionEstimator:
         free = np.clip(1.0 - np.diag(kept), 0.0, 1.0)
         skidding = math.sqrt(SKID_DENSITY_MPS2**2 + spread**2 * SKID_S + _density2(skid_m2ps))
         if not self._planar:
-            # What an accelerometer would read: gravity along the tilted axes, and its bias.
-            force = force + GRAVITY_MPS2 * R[2, :2] + before.bias.accelerometer()[:2]
+            # An accelerometer reads the acceleration less gravity, and its bias.
+            force = force - gravity + before.bias.accelerometer()[:2]
         density = np.minimum(np.hypot((1.0 - free) * skidding, free * ACCEL_DENSITY_MPS2), ACCEL_DENSITY_MPS2)
         segments = [
             dataclasses.replace(
@@ -322,9 +333,10 @@ class FrictionEstimator:
 def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
 ) -> FrictionEstimator | None:
-    """The friction estimator; None unless adaptive, with gyro and both sides."""
+    """The friction estimator; None unless adaptive, with gyro and both sides, of wheels that are not steered."""
     inputs = config.inputs
-    if config.mode != "adaptive" or config.calibrate or not (inputs.sides and inputs.yaw == "gyro"):
+    usable = inputs.sides and inputs.yaw == "gyro" and config.rig.steering is None
+    if config.mode != "adaptive" or config.calibrate or not usable:
         return None
     return FrictionEstimator(config.rig, preintegrator, report, inputs.planar)
 
