@@ -333,7 +333,7 @@ class FrictionEstimator:
 def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
 ) -> FrictionEstimator | None:
-    """The friction estimator; None unless adaptive, with gyro and both sides, of wheels that are not steered."""
+    """The friction estimator; None unless adaptive, with gyro and both sides, and no wheel is steered."""
     inputs = config.inputs
     usable = inputs.sides and inputs.yaw == "gyro" and config.rig.steering is None
     if config.mode != "adaptive" or config.calibrate or not usable:

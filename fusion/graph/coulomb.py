@@ -3,11 +3,12 @@
 Each wheel drags its quarter of the robot against its slip velocity over the ground (the circle of friction,
 Wong 2008, Theory of Ground Vehicles, sec. 1.4)::
 
-    du/dt = gravity - friction / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2),   s_i = u + omega x r_i - (wheel speed, 0)
+    du/dt = gravity - friction / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2)
+    s_i = u + omega x r_i - (wheel speed, 0)
 
-with `friction` = mu g and gravity along the ground. Below `SLIP_SPEED_MPS` the drag acts as a damper, so that a robot whose wheels hold
-moves as they roll. In a turn the wheels of a skid-steered robot slip already, and hold less against
-sliding outwards.
+with `friction` = mu g and gravity along the ground. Below `SLIP_SPEED_MPS` the drag acts as a damper, so
+that a robot whose wheels hold moves as they roll. In a turn the wheels of a skid-steered robot slip
+already, and hold less against sliding outwards.
 """
 
 import math
