@@ -1,11 +1,10 @@
 """Estimates friction with a bank of models, each scored against the displacement between GNSS fixes.
 
-Wheels on ice measure the wrong speed: friction limits how fast the robot follows them.
-`FrictionEstimator` propagates a velocity for each of `FRICTION_MPS2` from wheels and gyro
-(`graph.coulomb`), compares the paths with fixes a second apart and weighs the models by their likelihood
-(multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). The graph then takes displacement and
-horizontal acceleration from the friction model instead of wheels and accelerometer: after seconds its limit
-is better known than tilt and bias.
+Without an accelerometer only the wheels measure speed, and on ice they are wrong: friction limits how fast
+the robot follows them. `FrictionEstimator` propagates a velocity for each of `FRICTION_MPS2` from wheels
+and gyro (`graph.coulomb`), compares the paths with fixes a second apart and weighs the models by their
+likelihood (multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). The planar graph then takes
+displacement and acceleration from the friction model instead of the wheels.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
@@ -39,9 +37,8 @@ SLIPPERY_MPS2 = 2.0
 """Limit (ice, wet or snowy ground) up to which friction may lead; above it wheels do nearly as well."""
 SLIPPERY = FRICTION_MPS2[FRICTION_MPS2 <= SLIPPERY_MPS2]
 LEAD_PROBABILITY = 0.9999
-"""Probability of friction, at any limit, from which it leads on dry ground too, without an accelerometer:
-other causes of a bent path (soft ground, a hill, a jump of fixes) resemble friction sooner than rolling.
-Chosen on field logs."""
+"""Probability of friction, at any limit, from which it leads on dry ground too: other causes of a bent path
+(soft ground, a hill, a jump of fixes) resemble friction sooner than rolling. Chosen on field logs."""
 PRIOR_MPS2, PRIOR_SPREAD = 1.0, 0.7
 """Median friction limit of a skidding robot before any fix, and standard deviation of its logarithm
 (assumed)."""
@@ -72,19 +69,13 @@ class FrictionEstimator:
 
     Args:
         rig: track of the wheels and lever arm of the receiver.
-        preintegrator: makes the link between keyframes.
+        preintegrator: makes the planar link.
         report: called with every change.
-        planar: there is no accelerometer.
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        preintegrator: Preintegrator,
-        report: Callable[[WeightChange], None],
-        planar: bool = True,
+        self, rig: Rig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
     ) -> None:
-        self._planar = planar
         self.track_m = rig.track_m
         self.antenna_m = np.array(rig.sensors.gnss.antenna_m)
         self._preintegrator = preintegrator
@@ -117,8 +108,7 @@ class FrictionEstimator:
         weight = self.probabilities()
         if float(weight[: len(SLIPPERY)].sum()) > 0.5:
             return slice(len(SLIPPERY))
-        certain = self._planar and float(weight[:-1].sum()) > LEAD_PROBABILITY
-        return slice(len(FRICTION_MPS2)) if certain else None
+        return slice(len(FRICTION_MPS2)) if float(weight[:-1].sum()) > LEAD_PROBABILITY else None
 
     @property
     def mps2(self) -> float:
@@ -192,7 +182,7 @@ class FrictionEstimator:
 
         Args:
             t_ns, dt_s: end and length of the keyframe interval.
-            segments: of the IMU; in a planar graph with the specific force of a rolling robot.
+            segments: of the gyro, with the specific force of a rolling robot.
             wheels: as they rolled; None where samples are missing.
             before: state at the start.
             covariance: (dim, dim) of it.
@@ -226,10 +216,7 @@ class FrictionEstimator:
             self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
             here = np.tile((R @ self.antenna_m)[:2], (len(self._base), 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
-        gravity = self._gravity_mps2(before)
-        self._velocity, moved_m = skid_motion(
-            self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s, gravity
-        )
+        self._velocity, moved_m = skid_motion(self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s)
         rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _lateral_m(wheels, before)]
         moved_m = np.vstack([moved_m, rolled])
         turned = R @ (gtsam.Rot3.Rz(wheels.yaw_rad).matrix() - np.eye(3)) @ self.antenna_m
@@ -246,13 +233,6 @@ class FrictionEstimator:
             why = f"friction: {best} explains the displacement between fixes best"
             self._report(WeightChange(t_ns, "wheels", reported, now, "m/s2", why))
             self._reported_mps2 = now
-
-    def _gravity_mps2(self, before: KeyState) -> tuple[float, float]:
-        """Along body x and y; the ground of a planar graph is level."""
-        if self._planar:
-            return 0.0, 0.0
-        x, y, _ = (-GRAVITY_MPS2 * before.rotation[2]).tolist()
-        return x, y
 
     def _wheel_motion(
         self, wheels: WheelIncrement, before: KeyState, dt_s: float
@@ -281,8 +261,7 @@ class FrictionEstimator:
         start = (R.T @ before.velocity)[:2]
         starts = start + np.array([[0.0, 0.0], [_STEP_MPS, 0.0], [0.0, _STEP_MPS]])
         friction, spread = self._moments()
-        gravity = self._gravity_mps2(before)
-        ends, paths = skid_motion(starts, *motion, np.full(3, friction), self.track_m, dt_s, gravity)
+        ends, paths = skid_motion(starts, *motion, np.full(3, friction), self.track_m, dt_s)
         kept = (ends[1:] - ends[0]).T / _STEP_MPS
         carried_s = (paths[1:] - paths[0]).T / _STEP_MPS
         variance = np.diag(carried_s @ (R.T @ covariance[VELOCITY, VELOCITY] @ R)[:2, :2] @ carried_s.T)
@@ -290,9 +269,6 @@ class FrictionEstimator:
         force = (_rotation(half) @ ends[0] - _rotation(-half) @ start) / dt_s
         free = np.clip(1.0 - np.diag(kept), 0.0, 1.0)
         skidding = math.sqrt(SKID_DENSITY_MPS2**2 + spread**2 * SKID_S + _density2(skid_m2ps))
-        if not self._planar:
-            # An accelerometer reads the acceleration less gravity, and its bias.
-            force = force - gravity + before.bias.accelerometer()[:2]
         density = np.minimum(np.hypot((1.0 - free) * skidding, free * ACCEL_DENSITY_MPS2), ACCEL_DENSITY_MPS2)
         segments = [
             dataclasses.replace(
@@ -333,12 +309,12 @@ class FrictionEstimator:
 def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
 ) -> FrictionEstimator | None:
-    """The friction estimator; None unless adaptive, with gyro and both sides, and no wheel is steered."""
+    """The friction estimator; None unless planar with gyro and both sides, and adaptive."""
     inputs = config.inputs
-    usable = inputs.sides and inputs.yaw == "gyro" and config.rig.steering is None
-    if config.mode != "adaptive" or config.calibrate or not usable:
-        return None
-    return FrictionEstimator(config.rig, preintegrator, report, inputs.planar)
+    usable = inputs.planar and inputs.sides and inputs.yaw == "gyro" and not config.calibrate
+    return (
+        FrictionEstimator(config.rig, preintegrator, report) if usable and config.mode == "adaptive" else None
+    )
 
 
 def _density2(rate_m2ps: float) -> float:

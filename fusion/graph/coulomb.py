@@ -3,12 +3,11 @@
 Each wheel drags its quarter of the robot against its slip velocity over the ground (the circle of friction,
 Wong 2008, Theory of Ground Vehicles, sec. 1.4)::
 
-    du/dt = gravity - friction / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2)
-    s_i = u + omega x r_i - (wheel speed, 0)
+    du/dt = - friction / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2),   s_i = u + omega x r_i - (wheel speed, 0)
 
-with `friction` = mu g and gravity along the ground. Below `SLIP_SPEED_MPS` the drag acts as a damper, so
-that a robot whose wheels hold moves as they roll. In a turn the wheels of a skid-steered robot slip
-already, and hold less against sliding outwards.
+with `friction` = mu g. Below `SLIP_SPEED_MPS` the drag acts as a damper, so that a robot whose wheels hold
+moves as they roll. In a turn the wheels of a skid-steered robot slip already, and hold less against
+sliding outwards.
 """
 
 import math
@@ -31,7 +30,6 @@ def skid_motion(
     friction_mps2: Array,
     track_m: float,
     dt_s: float,
-    gravity_mps2: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Array, Array]:
     """Velocities at the end, in the body frame there, and displacements, in the body frame at the start, of K
     robots.
@@ -44,7 +42,6 @@ def skid_motion(
         left_mps, right_mps: circumferential speed of the wheels, their slip without force removed.
         yaw_rate_radps: rate at which the body turns.
         friction_mps2: (K,) largest acceleration by friction.
-        gravity_mps2: along body x and y, of a robot on a slope.
     """
     h, half = dt_s / SUBSTEPS, 0.5 * track_m
     pull = 0.25 * friction_mps2
@@ -55,8 +52,7 @@ def skid_motion(
     for i in range(SUBSTEPS):
         before_u, before_v = u, v
         u, v = c * u + s * v, c * v - s * u
-        k_xx = k_yy = k_xy = np.zeros_like(u)
-        a_x, a_y = np.full_like(u, gravity_mps2[0]), np.full_like(u, gravity_mps2[1])
+        a_x = a_y = k_xx = k_yy = k_xy = np.zeros_like(u)
         for side, wheel in ((1.0, left_mps), (-1.0, right_mps)):
             slip_x = u - (side * half * yaw_rate_radps + wheel)
             for end in (1.0, -1.0):
