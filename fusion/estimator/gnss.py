@@ -428,7 +428,7 @@ class GnssUpdater:
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
         reported_m = fix.horizontal_sigma_m * inflation
-        slow = math.sqrt(1.0 - self.white) / SLOW_SIGMA
+        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = min(self._class_scale.get(fix.fix, 1.0), OPTIMISM * reported_m / self.sheet_sigma_m)
         self._least_drift_m = SLOW_SIGMA * reported_m / scale
         return slow * scale
