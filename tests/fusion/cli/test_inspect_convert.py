@@ -52,14 +52,14 @@ def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, st
 
 
 @pytest.mark.parametrize(
-    "command", [("inspect", "LOG"), ("convert", "LOG", "OUT"), ("calibrate", "LOG", "--sensors")]
+    "command", [("inspect", "LOG"), ("convert", "LOG", "OUT"), ("calibrate", "LOG", "--sensors", "--out", "OUT.yaml")]
 )
 def test_options_that_a_log_folder_has_no_use_for_are_warned_of(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
     columns = tmp_path / "map.yaml"
     columns.write_text("time: t\n")
-    words = [{"LOG": str(log), "OUT": str(tmp_path / "out")}.get(word, word) for word in command]
+    words = [word.replace("LOG", str(log)).replace("OUT", str(tmp_path / "out")) for word in command]
     _, _, err = run(capsys, *words, "--topic", "imu=/imu", "--columns", columns)
     warned = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert warned == [
