@@ -52,7 +52,8 @@ def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, st
 
 
 @pytest.mark.parametrize(
-    "command", [("inspect", "LOG"), ("convert", "LOG", "OUT"), ("calibrate", "LOG", "--sensors", "--out", "OUT.yaml")]
+    "command",
+    [("inspect", "LOG"), ("convert", "LOG", "OUT"), ("calibrate", "LOG", "--sensors", "--out", "OUT.yaml")],
 )
 def test_options_that_a_log_folder_has_no_use_for_are_warned_of(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
