@@ -18,6 +18,7 @@ from terrafusion.fusion.calibration.mounting import Angle
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
+    COURSE_LAG,
     GNSS_DELAY,
     GYRO_BIAS,
     TURN_SCALE,
@@ -48,6 +49,7 @@ ROWS = {
     "wheel_scale": WHEEL_SCALE,
     "gnss_delay_s": GNSS_DELAY,
     "wheel_delay_s": WHEEL_DELAY,
+    "course_lag_s": COURSE_LAG,
 }
 OF_GYRO, OF_WHEELS = ("gyro_scale", "gyro_bias_radps"), ("yaw_factor",)
 """Numbers that exist where the yaw rate comes from the gyro, and from the wheels."""

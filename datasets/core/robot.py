@@ -136,6 +136,7 @@ class SensorNumbers:
         yaw_factor: true yaw rate over that of the wheels and the track, where there is no gyro.
         wheel_scale: true distance over that of the wheels, less one; usual slip included.
         gnss_delay_s, wheel_delay_s: lateness of the stamps against those of the IMU.
+        course_lag_s: time by which the course follows the heading, of a robot that skids outwards in turns.
         imu_roll_rad, imu_pitch_rad, imu_yaw_rad: angles at which the IMU is mounted: readings turned about x,
             then y, then z by them are in body axes.
     """
@@ -147,6 +148,7 @@ class SensorNumbers:
     wheel_scale: Ratio | None = None
     gnss_delay_s: Delay | None = None
     wheel_delay_s: Delay | None = None
+    course_lag_s: Delay | None = None
     imu_roll_rad: Tilt | None = None
     imu_pitch_rad: Tilt | None = None
     imu_yaw_rad: Annotated[KnownNumber, Known(Quantity("rad", -3.1416, 3.1416))] | None = None

@@ -78,5 +78,5 @@ def started(drive: Drive, start: complex, yaw_rad: float, numbers: Array) -> Nod
 
 
 def information_gained(before: Knowledge, after: Knowledge) -> Array:
-    """Information gained on each number (7,), nats: the logarithm of its sigma before over after."""
+    """Information gained on each number (8,), nats: the logarithm of its sigma before over after."""
     return np.asarray(np.log(before.sigma / after.stated_sigma(before)))

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.numbers import GYRO_BIAS, NUMBERS, TURN_SCALE, WHEEL_DELAY
+from terrafusion.fusion.calibration.numbers import COURSE_LAG, GYRO_BIAS, NUMBERS, TURN_SCALE, WHEEL_DELAY
 
 Complex = NDArray[np.complex128]
 
+LEAST_STEP_S = 1e-3
 LEAST_NODE_S, LONGEST_NODE_S = 2.0, 30.0
 NODE_M, NODE_SIGMAS, LONGEST_NODE_M = 4.0, 20.0, 40.0
 """A new node after 2 s and a distance that the fixes show to 5 %, from 4 to 40 m; or after 30 s."""
@@ -67,8 +68,8 @@ class Path:
     Attributes:
         yaw_rad: (N + 1,) from 0.
         z: (N + 1,) position without slip, east + i north for yaw 0 at the start, m.
-        yaw_by: (N + 1, 7) derivatives of the yaw by `NUMBERS`; zero where there is none.
-        z_by: (N + 1, 7) of the position.
+        yaw_by: (N + 1, 8) derivatives of the yaw by `NUMBERS`; zero where there is none.
+        z_by: (N + 1, 8) of the position.
     """
 
     yaw_rad: Array
@@ -78,7 +79,7 @@ class Path:
 
 
 def dead_reckoned(drive: Drive, numbers: Array, begin: int = 0, end: int | None = None) -> Path:
-    """The path of `drive` by wheels and turns with `numbers` (7,), from sample `begin` to `end`."""
+    """The path of `drive` by wheels and turns with `numbers` (8,), from sample `begin` to `end`."""
     end = len(drive.t_s) - 1 if end is None else end
     t_s = drive.t_s[begin : end + 1]
     dt, distance_m = np.diff(t_s), drive.distance_m[begin:end]
@@ -87,15 +88,18 @@ def dead_reckoned(drive: Drive, numbers: Array, begin: int = 0, end: int | None 
     yaw = _summed(turn)
     gained = _speed_gained(drive, begin, end)
     step = distance_m + numbers[WHEEL_DELAY] * gained
-    middle = np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1]))
+    per_s = 1.0 / np.maximum(dt, LEAST_STEP_S)
+    lag_s, rate = numbers[COURSE_LAG], turn * per_s
+    middle = np.exp(1j * (0.5 * (yaw[1:] + yaw[:-1]) - lag_s * rate))
     yaw_by = np.zeros((len(yaw), len(NUMBERS)))
     yaw_by[:, TURN_SCALE] = yaw / rate_scale
     yaw_by[:, GYRO_BIAS] = -rate_scale * (t_s - t_s[0])
     z_by = np.zeros((len(yaw), len(NUMBERS)), dtype=complex)
     for number in (TURN_SCALE, GYRO_BIAS):
-        by = 0.5 * (yaw_by[1:, number] + yaw_by[:-1, number])
+        by = 0.5 * (yaw_by[1:, number] + yaw_by[:-1, number]) - lag_s * np.diff(yaw_by[:, number]) * per_s
         z_by[:, number] = _summed(1j * by * step * middle)
     z_by[:, WHEEL_DELAY] = _summed(gained * middle)
+    z_by[:, COURSE_LAG] = _summed(-1j * rate * step * middle)
     return Path(yaw, _summed(step * middle), yaw_by, z_by)
 
 

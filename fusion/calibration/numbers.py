@@ -18,6 +18,7 @@ NUMBERS = (
     "antenna_y_m",
     "gnss_delay_s",
     "wheel_delay_s",
+    "course_lag_s",
 )
 """In the order of every vector of numbers:
 
@@ -25,8 +26,12 @@ NUMBERS = (
 - gyro_bias: mean reading of the source of yaw without any turn.
 - wheel_scale: true distance over that of the wheels, less one; slip of the usual ground included.
 - antenna: correction of the lever arm, body x and y.
-- gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw."""
-TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY = range(len(NUMBERS))
+- gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw.
+- course_lag: time by which the course follows the heading: in a turn at rate w a robot drifts outwards by
+  the angle course_lag w."""
+TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY, COURSE_LAG = range(
+    len(NUMBERS)
+)
 
 GYRO_SCALE_SIGMA, WHEEL_TURN_SIGMA = 0.015, 0.35
 """Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), and
@@ -39,10 +44,13 @@ ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
 GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
 """Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
-IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0])
+SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.02
+"""Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
+0.3 s, study `course_lag`), and of those that roll (assumed)."""
+IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
-CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01]), 0.05
+CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01, 0.05]), 0.05
 """Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
 the turn scale where there is no gyro."""
 
@@ -52,8 +60,8 @@ class Knowledge:
     """Mean and covariance of `NUMBERS`, and how slip changes between stretches of ground.
 
     Attributes:
-        mean: (7,).
-        covariance: (7, 7).
+        mean: (8,).
+        covariance: (8, 8).
         slip_spread: standard deviation of the distance ratio about `wheel_scale`.
         slip_time_s: correlation time of that ratio.
     """
@@ -65,18 +73,22 @@ class Knowledge:
 
     @property
     def sigma(self) -> Array:
-        """1 sigma (7,)."""
+        """1 sigma (8,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def stated_sigma(self, before: Knowledge) -> Array:
-        """1 sigma (7,) with what slip imitates; at most that `before` the drive."""
+        """1 sigma (8,) with what slip imitates; at most that `before` the drive."""
         return np.asarray(np.minimum(np.hypot(self.sigma, IMITATED), before.sigma))
 
 
 def assumed(
-    bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float, slip_time_s: float
+    bias_sigma_radps: float,
+    yaw_of_wheels: bool,
+    slip_spread: float,
+    slip_time_s: float,
+    skids: bool = False,
 ) -> Knowledge:
-    """What is known of a robot before it drives."""
+    """What is known of a robot before it drives; `skids`: its wheels or tracks skid in every turn."""
     sigma = np.array(
         [
             WHEEL_TURN_SIGMA if yaw_of_wheels else GYRO_SCALE_SIGMA,
@@ -86,6 +98,7 @@ def assumed(
             ANTENNA_SIGMA_M,
             GNSS_DELAY_SIGMA_S,
             WHEEL_DELAY_SIGMA_S,
+            SKIDDING_LAG_SIGMA_S if skids else ROLLING_LAG_SIGMA_S,
         ]
     )
     return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread, slip_time_s)
@@ -128,6 +141,7 @@ def _rows(known: SensorNumbers, yaw: str) -> dict[int, KnownNumber]:
         ANTENNA_Y: known.antenna_m,
         GNSS_DELAY: known.gnss_delay_s,
         WHEEL_DELAY: known.wheel_delay_s,
+        COURSE_LAG: known.course_lag_s,
     }
     return {row: number for row, number in rows.items() if number is not None}
 

@@ -390,10 +390,9 @@ class Estimator:
         rig, inputs, bias_z = self.config.rig, self.config.inputs, float(before.bias.gyroscope()[2])
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         change = self.wheels.speed_change_mps(before_ns, t_ns)
-        noise, surging = self.weights.noise, self.config.calibrate
-        increment = self._jitter.applied(
-            wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging)
-        )
+        noise, calibrates, lag_s = self.weights.noise, self.config.calibrate, self.learned.course_lag_s()
+        path = travelled, segments, bias_z, rig.track_m, quantum_m
+        increment = self._jitter.applied(wheel_increment(*path, noise, change, calibrates, lag_s))
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
             return self._turn.between(before_ns, t_ns, increment, self.steering, self._covariance)

@@ -39,12 +39,14 @@ def wheel_increment(
     noise: SensorNoise,
     speed_change_mps: float = 0.0,
     surging: bool = False,
+    course_lag_s: tuple[float, float] = (0.0, 0.0),
 ) -> WheelIncrement:
     """Displacement of the body origin and turn by wheels and gyro.
 
     The travelled distance is spread evenly over the interval and turned by the yaw integrated from the
     gyro (bias removed), exactly for constant rates. `surging`: with the part that the acceleration asks
-    for.
+    for. `course_lag_s`: in a turn at rate w the body drifts outwards by the angle `course_lag_s` w;
+    mean, and 1 sigma between grounds.
     """
     left, right = travelled_m
     distance = 0.5 * (left + right)
@@ -57,6 +59,8 @@ def wheel_increment(
         x += chord * math.cos(yaw + 0.5 * turn)
         y += chord * math.sin(yaw + 0.5 * turn)
         yaw += turn
+    lag_s, lag_sigma_s = course_lag_s
+    y -= lag_s * yaw / total * distance
     forward = math.hypot(noise.wheel_sigma_mps * total, quantum_m)
     across = noise.side_slip_sigma * abs(distance) + FLOOR_M
     up = UP_SIDE_RATIO * abs(distance) + FLOOR_M
@@ -65,7 +69,10 @@ def wheel_increment(
     sigma = np.array([forward, across, up, turn_sigma])
     asking_m = abs(distance) + SURGE_SPEED_MPS * total if surging else 0.0
     surge_m = asking_m * speed_change_mps / (GRAVITY_MPS2 * total)
-    return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps, surge_m)
+    return WheelIncrement(
+        np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps, surge_m,
+        course_lag_sigma_s=lag_sigma_s,
+    )  # fmt: skip
 
 
 def no_motion_factor(k: int) -> gtsam.NonlinearFactor:

@@ -92,6 +92,8 @@ def step(
     downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * ahead * float(up[1])
     sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = math.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill)
+    if wheels is not None:
+        sigma[4] = math.hypot(ICR_SIGMA_M, wheels.course_lag_sigma_s * wheels.distance_m / dt_s)
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
     mean = [noise.slip_at(grade), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]

@@ -58,6 +58,7 @@ class WheelIncrement:
         speed_change_mps: wheel speed at the end less that at the start.
         surge_m: a / g (|distance| + v0 dt) of wheels that accelerate by a; 0 unless calibrated.
         skid_m: distance along body x that the wheels rolled and the robot, by friction, did not move.
+        course_lag_sigma_s: spread of the centre of rotation along body x per speed, between grounds.
     """
 
     displacement_m: Array
@@ -68,6 +69,7 @@ class WheelIncrement:
     speed_change_mps: float = 0.0
     surge_m: float = 0.0
     skid_m: float = 0.0
+    course_lag_sigma_s: float = 0.0
 
     def without_turn(self) -> Self:
         """The increment without a measurement of the turn."""

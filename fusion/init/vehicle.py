@@ -35,6 +35,7 @@ COMMENTS = {
     "wheel_scale": "true distance over that of the wheels, less one; usual slip included",
     "gnss_delay_s": "s; lateness of the stamps of the fixes",
     "wheel_delay_s": "s; lateness of the stamps of the wheels",
+    "course_lag_s": "s; by which the course follows the heading",
     "imu_yaw_rad": "rad; angle of the IMU about z, to the left",
 }
 

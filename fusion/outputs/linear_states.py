@@ -41,6 +41,7 @@ QUANTITIES = {
 SHOWN = QUANTITIES | {
     "turn_scale": StateQuantity("turns beyond those of the source of yaw", "%", 100.0),
     "wheel_scale": StateQuantity("distance beyond that of the wheels", "%", 100.0),
+    "course_lag_s": StateQuantity("course behind the heading, in turns", "s", 1.0),
 }
 """With the numbers of self-calibration."""
 

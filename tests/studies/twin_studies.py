@@ -112,6 +112,18 @@ TWIN = (
         1,
     ),
     Study(
+        "course_lag",
+        "By how much does the course of a robot that skids follow its heading?",
+        module("course_lag"),
+        1,
+        {
+            "asphalt": r"warthog on asphalt: (.*? s),",
+            "gravel": r"warthog on gravel: (.*? s),",
+            "ice": r"warthog on ice: (.*? s),",
+            "husky": r"husky on unlabelled ground: (.*? s),",
+        },
+    ),
+    Study(
         "gap_sites",
         "Does the diagnosis hold on ground that varies more than the references'?",
         module("gap_sites", "--out", OUT),

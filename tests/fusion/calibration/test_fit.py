@@ -14,6 +14,7 @@ from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_sta
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
+    COURSE_LAG,
     GNSS_DELAY,
     NUMBERS,
     TURN_SCALE,
@@ -23,7 +24,7 @@ from terrafusion.fusion.calibration.numbers import (
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
-TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0])
+TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.01])
 PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03, slip_time_s=300.0)
 STEP_S = 0.1
 
@@ -49,7 +50,8 @@ def figure(
         + slip * np.repeat(rng.normal(size=len(middle) // 80 + 1), 80)[: len(middle)]
     )
     yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    z = np.concatenate([[0j], np.cumsum(speed * STEP_S * np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1])))])
+    course = 0.5 * (yaw[1:] + yaw[:-1]) - numbers[COURSE_LAG] * rate
+    z = np.concatenate([[0j], np.cumsum(speed * STEP_S * np.exp(1j * course))])
     measured = turn / (1.0 + numbers[0]) + numbers[1] * STEP_S
     stamps = np.arange(3.0, seconds - 1.0, 1.0)
     at = stamps - numbers[GNSS_DELAY]
@@ -123,6 +125,19 @@ def test_errors_are_covered_by_their_sigmas(sigma_m: float) -> None:
     square = np.mean(np.square(np.array(errors)[:, :6]))
     assert square < 2.0, np.array(errors).round(1)
     assert np.mean(np.abs(np.array(errors)[:, :6]) < 2.0) > 0.85
+
+
+def test_a_course_that_lags_in_turns_does_not_look_like_late_fixes() -> None:
+    """A robot that skids drifts outwards: its fixes seem late against the gyro, and its wheels as late."""
+    lagging = TRUE.copy()
+    lagging[GNSS_DELAY], lagging[COURSE_LAG] = 0.0, 0.2
+    drive = figure(300.0, lagging, fix_sigma_m=0.02, slip=0.01)
+    skids = assumed(0.005, False, 0.03, 300.0, skids=True)
+    found = fit([drive], [(0j, 0.0)], skids, NOISE)
+    assert found.mean[COURSE_LAG] == pytest.approx(0.2, abs=0.05)
+    assert abs(found.mean[GNSS_DELAY]) < 0.05
+    rolling = fit([drive], [(0j, 0.0)], PRIOR, NOISE)
+    assert rolling.mean[GNSS_DELAY] > 0.1
 
 
 def correlated(count: int, sigma: float, share: float, rng: np.random.Generator) -> Array:

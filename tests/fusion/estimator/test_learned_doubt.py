@@ -10,6 +10,7 @@ import pytest
 
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
+    COURSE_LAG,
     GNSS_DELAY,
     IMITATED,
     NUMBERS,
@@ -18,6 +19,7 @@ from terrafusion.fusion.calibration.numbers import (
     Knowledge,
     assumed,
 )
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import (
     SLIDE_SEEN_NS,
@@ -199,3 +201,28 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
     learning.known = dataclasses.replace(learning.known, slip_spread=0.2)
     assert not learned._explained(learning)
     learning.known, learning.misfit, learning.turned_rad = was
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "spread", "taken_s"), [(0.2, 0.03, 0.2), (-0.2, 0.03, 0.0), (0.2, 0.3, 0.0)]
+)
+def test_the_course_lags_outwards_and_of_rolling_wheels_alone(
+    driving: Estimator, monkeypatch: pytest.MonkeyPatch, lag_s: float, spread: float, taken_s: float
+) -> None:
+    mean = driving.learned._before.mean.copy()
+    mean[COURSE_LAG] = lag_s
+    known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), spread, 300.0)
+    monkeypatch.setattr(driving.learned, "_known", known)
+    assert driving.learned.course_lag_s()[0] == taken_s
+
+
+def test_only_robots_that_skid_have_a_course_lag_that_changes_with_the_ground() -> None:
+    husky = load_vehicle("husky")
+    for drive, skids in (
+        ("skid_steer", True),
+        ("tracked", True),
+        ("differential", False),
+        ("ackermann", False),
+    ):
+        config = EstimatorConfig(dataclasses.replace(husky.rig(), drive=drive), husky.name)
+        assert (Estimator(config).learned.course_lag_s()[1] > 0.0) is skids

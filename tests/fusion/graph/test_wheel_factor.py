@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from terrafusion.fusion.graph.factors import wheel_increment
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, SLIP, SURGE_SLIP
 from terrafusion.fusion.graph.wheel_factor import MOVED_M, WheelIncrement, slip_of
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.noise.policy import load_policy
 
 SIGMA = np.array([0.03, 0.05, 0.05, 0.01])
 
@@ -40,3 +45,22 @@ def test_extra_variance_lies_in_the_plane() -> None:
     sigma = increment().with_extra_variance(0.04**2).sigma
     np.testing.assert_allclose(sigma, [0.05, np.hypot(0.05, 0.04), 0.05, 0.01])
     assert increment().without_turn().sigma.tolist() == [0.03, 0.05, 0.05, np.inf]
+
+
+@given(st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(0.0, 0.3))
+def test_a_course_that_lags_is_turned_outwards_by_the_lag_times_the_rate(
+    speed_mps: float, rate_radps: float, lag_s: float
+) -> None:
+    dt = 0.1
+    segment = ImuSegment(dt, np.array([0.0, 0.0, rate_radps]), np.zeros(3))
+    rolled = (speed_mps * dt, speed_mps * dt)
+
+    def moved(lag_s: float) -> np.ndarray:
+        noise = load_policy().fixed
+        return wheel_increment(
+            rolled, [segment], 0.0, 1.0, 0.0, noise, course_lag_s=(lag_s, 0.2)
+        ).displacement_m
+
+    outwards_m = -lag_s * rate_radps * speed_mps * dt
+    assert np.allclose(moved(lag_s) - moved(0.0), [0.0, outwards_m, 0.0], atol=1e-12)
+    assert outwards_m * rate_radps * speed_mps <= 0.0  # against the acceleration towards the centre
