@@ -44,7 +44,7 @@ ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
 GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
 """Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
-SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.02
+SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
 """Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
 0.3 s, study `course_lag`), and of those that roll (assumed)."""
 IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])

@@ -20,6 +20,7 @@ from terrafusion.fusion.calibration.numbers import (
     GYRO_BIAS,
     NUMBERS,
     TURN_SCALE,
+    WHEEL_DELAY,
     WHEEL_SCALE,
     Knowledge,
     assumed,
@@ -55,6 +56,8 @@ TURN_TIME_S = 10.0
 
 CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 """Numbers that correct a sensor; the others only describe its noise or belong to another state."""
+LOOK_ALIKE = [*CORRECTED, WHEEL_DELAY, COURSE_LAG]
+"""Numbers of which one can look like another."""
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 """Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
 rotation look alike (assumed)."""
@@ -66,6 +69,8 @@ LEAST_LATE_S, LEAST_LATE_TURNING_S, TURNING_RAD, MOST_MISFIT = 0.3, 0.15, 3.0, 1
 """Fixes later than the first (wheels that spin look less late), or than the second where the robot turned by
 so much, another antenna or another gyro can look like a slide; they explain it if the fixes then lie within
 about three of their sigma: a slide leaves a hundred and more (assumed)."""
+SURELY_IMITATED = np.array([0.0, 0.03, 0.03, 0.03])
+"""1 sigma of what slip adds to these numbers on any ground (turn share, m, m, s; assumed)."""
 CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
@@ -288,16 +293,18 @@ class LearnedNumbers:
         At one speed an antenna further ahead and fixes that come earlier look alike: what is shown
         is conditional on those numbers being as before that the drive does not refute.
         """
-        mean, before = known.mean[CORRECTED], self._before.mean[CORRECTED]
-        covariance = known.covariance[np.ix_(CORRECTED, CORRECTED)]
-        off, sigma = np.abs(mean - before), known.sigma[CORRECTED]
+        off, sigma = known.mean - self._before.mean, known.sigma
+        corrected, size = self._before.mean[CORRECTED], np.abs(off[CORRECTED])
         limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
+        limit = limit * np.hypot(sigma[CORRECTED], SURELY_IMITATED)
         rolling = known.slip_spread < MOST_SPREAD
-        self._clear = clear = (off > limit * sigma) & (off > LEAST_CORRECTION) & rolling
-        out, kept = before.copy(), off < REFUTED_SIGMA * sigma
-        gain = covariance[np.ix_(clear, kept)] @ np.linalg.pinv(covariance[np.ix_(kept, kept)])
-        out[clear] = mean[clear] + gain @ (before - mean)[kept]
-        return out
+        self._clear = clear = (size > limit) & (size > LEAST_CORRECTION) & rolling
+        shown = [i for i, is_clear in zip(CORRECTED, clear.tolist(), strict=True) if is_clear]
+        kept = [i for i in LOOK_ALIKE if i not in shown and abs(off[i]) < REFUTED_SIGMA * sigma[i]]
+        covariance = known.covariance
+        gain = covariance[np.ix_(shown, kept)] @ np.linalg.pinv(covariance[np.ix_(kept, kept)])
+        corrected[clear] += off[shown] - gain @ off[kept]
+        return corrected
 
 
 def _doubt_place(chain: Chain, moved_m: float) -> None:

@@ -24,7 +24,7 @@ from terrafusion.fusion.calibration.numbers import (
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
-TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.01])
+TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.004])
 PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03, slip_time_s=300.0)
 STEP_S = 0.1
 

@@ -11,7 +11,7 @@ import pytest
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import online
 from terrafusion.fusion.calibration.motion import Drive
-from terrafusion.fusion.calibration.numbers import GNSS_DELAY, NUMBERS, Knowledge
+from terrafusion.fusion.calibration.numbers import COURSE_LAG, GNSS_DELAY, NUMBERS, Knowledge
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.twin.simulate import simulate
@@ -157,7 +157,9 @@ def test_before_the_first_sample_a_fix_has_no_time() -> None:
 
 
 def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior() -> None:
-    """The place of the antenna along x is given to a millimetre: no drive tells it better."""
+    """The place of the antenna along x is given to a millimetre, and wheels that roll have no course lag: no
+    drive tells these better.
+    """
     covariance = PRIOR.covariance.copy()
     covariance[3, 3] = 1e-6
     given = dataclasses.replace(PRIOR, covariance=covariance)
@@ -166,7 +168,7 @@ def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior()
     ended = driven(figure(300.0, fix_sigma_m=0.05), learning, until=lambda: learning.before is not given)
     known, begin = ended[-1], learning.before
     wider, prior = known.covariance * online.FORGOTTEN, np.diag(covariance)
-    assert (np.diag(wider) > prior).tolist() == [i == 3 for i in range(len(prior))]
+    assert (np.diag(wider) > prior).tolist() == [i in (3, COURSE_LAG) for i in range(len(prior))]
     assert np.diag(begin.covariance) == pytest.approx(np.minimum(np.diag(wider), prior), rel=1e-9)
     correlations = [c / np.sqrt(np.outer(np.diag(c), np.diag(c))) for c in (wider, begin.covariance)]
     assert np.allclose(*correlations, atol=1e-9)
