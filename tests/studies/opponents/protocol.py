@@ -1,12 +1,13 @@
 """Strict errors in outages: how they are laid out, and what is scored.
 
-After 60 s (or 40 % of a short log) fixes are withheld again and again. Every second outage is one pass, so
-that an estimator finds its way back between two outages of a pass. Scored is the horizontal error at the last
+After 60 s (or 40 % of a short log) fixes are withheld again and again. Outages of one pass are as far apart
+as they are long, so that an estimator finds its way back between them. Scored is the horizontal error at the last
 reference before the end of the outage. All times are s from the start of the recording.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -33,7 +34,7 @@ class Streams:
     """What a planar estimator needs: speed and yaw rate at `t_s` (N,), fixes (M, 4), reference (K, 3).
 
     The yaw rate is the mean of the gyro since the sample before. Fixes are time, east, north, sigma; the
-    reference is time, x, y.
+    reference is time, x, y. Outages begin every `apart_s`, by default every two lengths.
     """
 
     t_s: Array
@@ -41,12 +42,13 @@ class Streams:
     w_radps: Array
     fixes: Array
     reference: Array
+    apart_s: float | None = None
 
     def starts(self, seconds: float) -> Array:
         """Starts of outages of one length."""
         first, last = self.t_s[0], self.t_s[-1]
         warm = min(WARM_S, WARM_SHARE * (last - first))
-        return np.arange(first + warm, last - seconds, max(2.0 * seconds, LEAST_APART_S))
+        return np.arange(first + warm, last - seconds, self.apart_s or _usually_apart_s(seconds))
 
     def driven_m(self, start_s: float, seconds: float) -> float:
         """Path of the wheels in an outage."""
@@ -55,10 +57,10 @@ class Streams:
 
     def passes(self, seconds: float) -> list[list[float]]:
         """Starts of the scored outages, pass by pass."""
-        starts = self.starts(seconds).tolist()
-        scored = [
-            [a for a in part if self.driven_m(a, seconds) > LEAST_M] for part in (starts[::2], starts[1::2])
-        ]
+        starts, usual_s = self.starts(seconds).tolist(), _usually_apart_s(seconds)
+        passes = math.ceil(2.0 * usual_s / (self.apart_s or usual_s))
+        parts = [starts[k::passes] for k in range(passes)]
+        scored = [[a for a in part if self.driven_m(a, seconds) > LEAST_M] for part in parts]
         return [part for part in scored if part]
 
     def reference_at(self, start_s: float, seconds: float) -> Array | None:
@@ -74,6 +76,10 @@ class Streams:
         before = t_s < start_s + seconds
         at = [np.interp(reference[0], t_s[before], path_m[before, c]) for c in (0, 1)]
         return float(np.hypot(at[0] - reference[1], at[1] - reference[2]))
+
+
+def _usually_apart_s(seconds: float) -> float:
+    return max(2.0 * seconds, LEAST_APART_S)
 
 
 def streams_of(recording: Recording, vehicle: VehicleParams) -> Streams | None:

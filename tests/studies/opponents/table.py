@@ -24,7 +24,8 @@ from tests.studies.opponents.inertial import Inertial
 from tests.studies.opponents.page import Cell, markdown, picture
 from tests.studies.parts import Task, TaskWorkers, code_of, library_code, result_of, run_all
 
-LENGTHS_S = (30.0, 60.0, 10.0)
+LENGTHS_S, APART_S = (30.0, 60.0, 10.0), 20.0
+"""Lengths of the outages, and the time between their begins: many logs have room for one, so they overlap."""
 DESCRIBED, UNKNOWN = "vehicle of the log", "wheel radius and track alone"
 HERE = Path(__file__).parent
 
@@ -60,7 +61,10 @@ def load(names: Sequence[str], runs: int) -> None:
 
     def prepare(drive: Drive) -> tuple[Drive, Inertial] | None:
         inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
-        return None if inputs is None else (drive, inputs)
+        if inputs is None:
+            return None
+        streams = dataclasses.replace(inputs.streams, apart_s=APART_S)
+        return drive, dataclasses.replace(inputs, streams=streams)
 
     _DRIVES[:] = prepared(names, runs, prepare)
 
