@@ -11,6 +11,7 @@ from terrafusion.datasets.checks.path import antenna, dead_reckoned
 from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.printable import times
 
 FROZEN_S = 3.0
 AROUND, LEAST_SHARE, SLIP_SHARE = 8, 0.5, 0.25
@@ -144,10 +145,9 @@ def check_frozen(context: CheckContext) -> Iterator[Finding]:
     for begin, end in zip(begins[frozen].tolist(), ends[frozen].tolist(), strict=True):
         repeats[begin + 1 : end + 1] = True
     worst = int(np.flatnonzero(frozen)[np.argmax(distance[frozen])])
-    times = "once" if frozen.sum() == 1 else f"{int(frozen.sum())} times"
     yield Finding(
         "gnss-frozen", "warning", "gnss",
-        f"the position stands still {times} while the wheels roll",
+        f"the position stands still {times(int(frozen.sum()))} while the wheels roll",
         f"from t = {t_fix[begins[worst]]:.1f} s for {t_fix[ends[worst]] - t_fix[begins[worst]]:.1f} s "
         f"and {distance[worst]:.1f} m of wheel path",
         f"drop the {int(repeats.sum())} repeated fixes",

@@ -1,4 +1,4 @@
-"""Text of foreign origin (names of files, channels and logs) as a terminal may show it."""
+"""Text for a terminal: that of foreign origin (names of files, channels and logs), and counts in words."""
 
 import re
 
@@ -9,3 +9,8 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e
 def printable(text: str) -> str:
     """The text with escapes, such as \\x1b, in place of what is no character to be seen."""
     return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+
+
+def times(count: int) -> str:
+    """How often, in words: "once", "3 times"."""
+    return "once" if count == 1 else f"{count} times"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from terrafusion.datasets.core.printable import times
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.inputs.door import MOST_MPS, MOST_MPS2, MOST_RADPS
 from terrafusion.fusion.inputs.leaps import LEAP_NS
@@ -11,9 +12,9 @@ from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
-    if times := estimator.breakdowns:
+    if breakdowns := estimator.breakdowns:
         notes.append(
-            f"the numbers broke down {times} times, and the estimator started anew: check units and axes"
+            f"the numbers broke down {times(breakdowns)}, and the estimator started anew: check units and axes"
         )
     if gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
@@ -25,12 +26,12 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     if gnss.too_late:
         notes.append(f"{gnss.too_late} GNSS fixes came before the start or too late for the lag")
     if gnss.turned:
-        notes.append(f"the heading was wrong and was set right from the motion {gnss.turned} times")
+        notes.append(f"the heading was wrong and was set right from the motion {times(gnss.turned)}")
     notes += gnss.plausible.notes()
     if gnss.velocities_refused:
         notes.append(f"{gnss.velocities_refused} GNSS velocities were far from what wheels and IMU allow")
     if gnss.skid.refutations:
-        notes.append(f"fixes showed {gnss.skid.refutations} times that the robot slid beside its wheels")
+        notes.append(f"fixes showed {times(gnss.skid.refutations)} that the robot slid beside its wheels")
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot slid, with a friction limit of {friction.mps2:.1f} m/s2")
@@ -53,8 +54,7 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             "over ten samples the counters"
         )
     if jumps := estimator.wheels.jumps:
-        often = "once" if jumps == 1 else f"{jumps} times"
-        notes.append(f"wheels: the counters jumped {often}; there the speeds gave the distance")
+        notes.append(f"wheels: the counters jumped {times(jumps)}; there the speeds gave the distance")
     if estimator.gyro.samples:
         notes.append(
             f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "

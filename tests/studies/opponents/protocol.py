@@ -1,8 +1,8 @@
 """Strict errors in outages: how they are laid out, and what is scored.
 
-After 60 s (or 40 % of a short log) fixes are withheld again and again. Outages of one pass are as far apart
-as they are long, so that an estimator finds its way back between them. Scored is the horizontal error at the last
-reference before the end of the outage. All times are s from the start of the recording.
+After 60 s (or 40 % of a short log) fixes are withheld again and again. Outages of one pass are as far
+apart as they are long, so that an estimator finds its way back between them. Scored is the horizontal error
+at the last reference before the end of the outage. All times are s from the start of the recording.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.printable import times
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, split_windows
@@ -109,12 +110,11 @@ class Planner:
                 f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
             )
             return NextRun(BY_HAND, pair, sigmas(best), why)
-        often = "once" if repeats == 1 else f"{repeats} times"
         mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
         load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
         why = (
             f"of {len(drives())} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
-            f"{sigmas(best):.1f} sigma with these runs at the size found; {often} should do{load}"
+            f"{sigmas(best):.1f} sigma with these runs at the size found; {times(repeats)} should do{load}"
         )
         return NextRun(best, pair, sigmas(best), why)
 
