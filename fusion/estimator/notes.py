@@ -14,7 +14,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     gnss, notes = estimator.gnss, []
     if breakdowns := estimator.breakdowns:
         notes.append(
-            f"the numbers broke down {times(breakdowns)}, and the estimator started anew: check units and axes"
+            f"the numbers broke down {times(breakdowns)}, and the estimator started anew: "
+            "check units and axes"
         )
     if gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
