@@ -14,6 +14,7 @@ from terrafusion.fusion.calibration.numbers import COURSE_LAG, GYRO_BIAS, NUMBER
 Complex = NDArray[np.complex128]
 
 LEAST_STEP_S = 1e-3
+"""Shorter times between samples show no rate."""
 LEAST_NODE_S, LONGEST_NODE_S = 2.0, 30.0
 NODE_M, NODE_SIGMAS, LONGEST_NODE_M = 4.0, 20.0, 40.0
 """A new node after 2 s and a distance that the fixes show to 5 %, from 4 to 40 m; or after 30 s."""

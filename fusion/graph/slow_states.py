@@ -9,7 +9,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.gauss_markov import MarkovStep, markov_step
-from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
+from terrafusion.fusion.graph.key_state import ICR_X, LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -57,6 +57,7 @@ CALIBRATION_SIGMA = {
 }
 """Prior 1 sigma of a vehicle file (assumed: tyre wear and pressure, tape measure, mounting plate, driver
 clocks)."""
+_ICR = ICR_X - NAV.stop
 _WALK_SIGMA = 2e-4 * np.array(list(CALIBRATION_SIGMA.values()))
 """Random walk of the calibration per sqrt(s), so that its covariance stays positive."""
 _CONSTANT = slice(6, 6 + len(CALIBRATION_SIGMA))
@@ -93,7 +94,7 @@ def step(
     sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = math.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill)
     if wheels is not None:
-        sigma[4] = math.hypot(ICR_SIGMA_M, wheels.course_lag_sigma_s * wheels.distance_m / dt_s)
+        sigma[_ICR] = math.hypot(ICR_SIGMA_M, wheels.course_lag_sigma_s * wheels.distance_m / dt_s)
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
     mean = [noise.slip_at(grade), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]

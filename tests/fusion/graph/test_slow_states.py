@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from terrafusion.fusion.noise.policy import load_policy
 
 ROWS = load_policy().classes
 SAND = ROWS["loose_sand"]
-SLIP, SIDE, SURGE = (LINEAR.index(name) for name in ("slip", "side_slip", "surge_slip"))
+SLIP, SIDE, SURGE, ICR = (LINEAR.index(name) for name in ("slip", "side_slip", "surge_slip", "icr_x_m"))
 LEVEL = np.array([0.0, 0.0, 1.0])
 
 
@@ -56,6 +58,13 @@ def test_a_step_keeps_the_stationary_spread(speed: float, change: float, switch:
     variance = taken.decay[SLIP] ** 2 * SAND.slip_sigma**2 + taken.sigma[SLIP] ** 2
     assert variance == pytest.approx(SAND.slip_sigma**2, rel=1e-6)
     assert taken.sigma[SLIP] == pytest.approx(step(rolling(-speed, -change), switch=switch).sigma[SLIP])
+
+
+@given(speed=st.floats(-3, 3), lag_s=st.floats(0, 0.5))
+def test_the_centre_of_rotation_of_wheels_that_skid_moves_with_the_speed(speed: float, lag_s: float) -> None:
+    taken = step(dataclasses.replace(rolling(speed), course_lag_sigma_s=lag_s))
+    variance = taken.sigma[ICR] ** 2 / (1.0 - taken.decay[ICR] ** 2)
+    assert variance == pytest.approx(slow_states.ICR_SIGMA_M**2 + (lag_s * speed) ** 2)
 
 
 def test_a_robot_that_backs_down_a_slope_slips_as_one_that_drives_down() -> None:
