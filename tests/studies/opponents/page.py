@@ -123,6 +123,10 @@ def _text(cell: Cell | None) -> str:
     return "" if cell is None else f"{median(cell.errors_m).text()}, {cell.percent:.1f} %"
 
 
+RATIOS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Marks of the axis of the picture."""
+
+
 def picture(cells: Sequence[Cell]) -> Figure:
     """Ratio to the best opponent, a row a log, a panel a state of knowledge."""
     from matplotlib.figure import Figure
@@ -136,13 +140,19 @@ def picture(cells: Sequence[Cell]) -> Figure:
         for mode, marker in zip(MODES, "os", strict=True):
             for seconds, colour in zip(sorted({c.seconds for c in cells}), ("C0", "C1", "C3"), strict=False):
                 found = [c for c in compared(cells, mode, known) if c.seconds == seconds]
+                if not found:
+                    continue
                 rows = [logs.index(c.log) for c in found]
                 label = f"{mode}, {seconds:g} s"
                 ax.scatter([c.ratio for c in found], rows, 22, colour, marker, alpha=0.75, label=label)
         ax.axvline(1.0, color="0.4", linewidth=1.0)
         ax.set_xscale("log")
+        ax.set_xticks(RATIOS, [f"{ratio:g}" for ratio in RATIOS])
+        ax.minorticks_off()
         format_axes(ax, x="median error / best opponent", title=known)
         ax.set_yticks(range(len(logs)), logs, fontsize=7)
     if kinds:
-        axes[0, -1].legend(fontsize=7, loc="best")
+        figure.legend(
+            *axes[0, 0].get_legend_handles_labels(), fontsize=7, loc="outside lower center", ncols=6
+        )
     return figure
