@@ -10,6 +10,7 @@ all else unknown. The spread and the correlation time of slip are estimated, too
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -61,10 +62,10 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
         information = information + one.information
         right = right + one.right
     covariance = np.linalg.inv(information)
-    step = covariance @ right
-    numbers = now.mean + step
-    moments = [one.apply(step, numbers) for one in reduced]
-    return Knowledge(numbers, covariance, *slip_process(moments, before.slip_spread, before.slip_time_s))
+    found = dataclasses.replace(now, mean=now.mean + covariance @ right, covariance=covariance).outwards()
+    moments = [one.apply(found.mean - now.mean, found.mean) for one in reduced]
+    spread, time_s = slip_process(moments, before.slip_spread, before.slip_time_s)
+    return dataclasses.replace(found, slip_spread=spread, slip_time_s=time_s)
 
 
 def started(drive: Drive, start: complex, yaw_rad: float, numbers: Array) -> Nodes:

@@ -47,6 +47,8 @@ GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
 SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
 """Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
 0.3 s, study `course_lag`), and of those that roll (assumed)."""
+NO_LAG_SIGMA_S = 1e-3
+"""1 sigma of a course lag of which the drive shows that there is none."""
 IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
@@ -75,6 +77,19 @@ class Knowledge:
     def sigma(self) -> Array:
         """1 sigma (8,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def outwards(self) -> Knowledge:
+        """With a course lag that is not negative: a robot that skids in a turn is carried outwards.
+
+        Where the best one is negative, all numbers are as they are without any.
+        """
+        lag_s, covariance = self.mean[COURSE_LAG], self.covariance
+        if lag_s >= 0.0:
+            return self
+        gain = covariance[:, COURSE_LAG] / covariance[COURSE_LAG, COURSE_LAG]
+        without = covariance - np.outer(gain, covariance[COURSE_LAG])
+        without[COURSE_LAG, COURSE_LAG] = NO_LAG_SIGMA_S**2
+        return dataclasses.replace(self, mean=self.mean - gain * lag_s, covariance=without)
 
     def stated_sigma(self, before: Knowledge) -> Array:
         """1 sigma (8,) with what slip imitates; at most that `before` the drive."""

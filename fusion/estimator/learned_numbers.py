@@ -41,9 +41,9 @@ from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 
-SKIDDING, GROUND_LAG_SIGMA_S = ("skid_steer", "tracked"), 0.2
-"""Drives whose wheels skid in every turn, and the spread of their course lag between grounds: a Warthog's is
-0.0 s on sand, 0.1 to 0.3 s on asphalt, grass and gravel and 0.6 s on ice (study `course_lag`)."""
+SKIDDING, GROUND_LAG_SIGMA_S = ("skid_steer", "tracked"), 0.1
+"""Drives whose wheels skid in every turn, and the spread of their course lag between grounds (assumed; a
+Warthog's is 0.0 s on sand, 0.1 to 0.3 s on asphalt, grass and gravel: study `course_lag`)."""
 SLIP_SPREAD = 0.05
 """Spread of slip between stretches of some tens of metres before any is driven (assumed)."""
 LEAST_SLIP_SIGMA = 0.02
@@ -182,12 +182,9 @@ class LearnedNumbers:
         return True
 
     def course_lag_s(self) -> tuple[float, float]:
-        """Time by which the course follows the heading, and its 1 sigma on other grounds; see `numbers`.
-
-        It is never negative: a robot that skids in a turn is carried outwards.
-        """
+        """Time by which the course follows the heading, and its 1 sigma on other grounds; see `numbers`."""
         rolls = self._known.slip_spread < MOST_SPREAD
-        learned_s = max(float(self._known.mean[COURSE_LAG]), 0.0) if rolls else 0.0
+        learned_s = float(self._known.mean[COURSE_LAG]) if rolls else 0.0
         return learned_s, GROUND_LAG_SIGMA_S if self._skids else 0.0
 
     def table(self) -> tuple[NumberAfterDrive, ...]:

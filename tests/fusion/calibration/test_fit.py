@@ -140,6 +140,21 @@ def test_a_course_that_lags_in_turns_does_not_look_like_late_fixes() -> None:
     assert rolling.mean[GNSS_DELAY] > 0.1
 
 
+def test_a_course_that_leads_is_none_that_lags() -> None:
+    """A robot that skids is carried outwards: what looks like the opposite is another number."""
+    leading = TRUE.copy()
+    leading[COURSE_LAG] = -0.1
+    drive = figure(300.0, leading, fix_sigma_m=0.02, slip=0.01)
+    skids = assumed(0.005, False, 0.03, 300.0, skids=True)
+    found = fit([drive], [(0j, 0.0)], skids, NOISE)
+    never = dataclasses.replace(skids, covariance=skids.covariance.copy())
+    never.covariance[COURSE_LAG, COURSE_LAG] = 1e-6
+    without = fit([drive], [(0j, 0.0)], never, NOISE)
+    assert abs(found.mean[COURSE_LAG]) < 1e-9
+    assert np.allclose(found.mean[:6], without.mean[:6], atol=0.2 * without.sigma[:6])
+    assert np.allclose(found.sigma[:6], without.sigma[:6], rtol=0.05)
+
+
 def correlated(count: int, sigma: float, share: float, rng: np.random.Generator) -> Array:
     """Noise (count, 2) of which each value keeps `share` of the one before."""
     noise = rng.normal(0.0, sigma, (count, 2))

@@ -33,7 +33,7 @@ def test_it_starts_anew_says_so_and_goes_on(error: type[Exception], monkeypatch:
         add_all(estimator, rest)
     assert estimator.latest() is None
     assert estimator.status in ("waiting", "aligning")
-    assert any("broke down 1 times" in note for note in notes_of(estimator))
+    assert any("broke down once" in note for note in notes_of(estimator))
     add_all(estimator, rest)
     state = estimator.latest()
     assert state is not None

@@ -203,10 +203,8 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
     learning.known, learning.misfit, learning.turned_rad = was
 
 
-@pytest.mark.parametrize(
-    ("lag_s", "spread", "taken_s"), [(0.2, 0.03, 0.2), (-0.2, 0.03, 0.0), (0.2, 0.3, 0.0)]
-)
-def test_the_course_lags_outwards_and_of_rolling_wheels_alone(
+@pytest.mark.parametrize(("lag_s", "spread", "taken_s"), [(0.2, 0.03, 0.2), (0.2, 0.3, 0.0)])
+def test_the_course_of_wheels_that_slip_is_not_taken_to_lag(
     driving: Estimator, monkeypatch: pytest.MonkeyPatch, lag_s: float, spread: float, taken_s: float
 ) -> None:
     mean = driving.learned._before.mean.copy()
