@@ -40,7 +40,8 @@ def call_back(callback: Callable[[Any], None] | None, value: Any) -> None:
 def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
     """A method that makes keyframes, guarded: where the numbers break down, the estimator starts anew.
 
-    It is as it was made, without its buffers and a given start; `breakdowns` counts on.
+    It is as it was made, without its buffers and a given start; `breakdowns` counts on, and turns by gyro
+    and wheels are still compared.
     """
 
     @functools.wraps(advance)
@@ -56,8 +57,10 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
             raise passed.error from None
         except BREAKDOWN:
             estimator.breakdowns += 1
+            unit = estimator.gyro.unit  # what the gyro reports in is still the same
             estimator.reset()
-            raise DataError(
+            estimator.gyro.unit = unit
+            raise unit.blamed() or DataError(
                 "the sensors contradict each other so far that no state fits them; the estimator starts anew",
                 remedy="check units, axes and vehicle file with `terrafusion inspect`",
             ) from None

@@ -32,6 +32,7 @@ class StuckGyro:
         stuck: the reading is wrong now.
         samples: number of readings replaced.
         doubt_rad: heading error since the reading was last right, to be taken into account.
+        unit: whether the readings are in rad/s.
     """
 
     def __init__(self, rig: Rig, inputs: SensorConfig) -> None:
@@ -40,7 +41,7 @@ class StuckGyro:
         self.doubt_rad = 0.0
         self._track_m, self._density = rig.track_m / YAW_RATIO, rig.sensors.imu.gyro_noise_radps_sqrthz
         self._sides = inputs.sides
-        self._unit = GyroUnit(rig.track_m, inputs.sides)
+        self.unit = GyroUnit(rig.track_m, inputs.sides)
         self._reading = float("nan")
         self._since_ns = 0
         self._count = 0
@@ -56,7 +57,7 @@ class StuckGyro:
         if gyro.shape != (3,) or not self._sides:  # the stream refuses the first
             return gyro
         reading = float(gyro[2])
-        self._unit.check(t_ns, reading, wheels)
+        self.unit.check(t_ns, reading, wheels)
         if reading != self._reading:
             self._reading, self._since_ns, self._count, self.stuck = reading, t_ns, 0, False
             return gyro

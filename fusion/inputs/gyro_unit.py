@@ -52,11 +52,24 @@ class GyroUnit:
             self._compare(*self._waiting, wheels)
             self._waiting = None
         if self.in_degrees:
-            raise DataError(
-                f"the gyro turns {min(map(abs, self._ratios)):.0f} times as far as the wheels, as in deg/s",
-                channel="imu",
-                remedy="give rad/s",
-            )
+            raise self._error()
+
+    def blamed(self) -> DataError | None:
+        """The error to raise where the estimate broke down: two windows are then enough to tell the unit."""
+        if len(self._ratios) >= 2 and self._far():
+            self.in_degrees = True
+            return self._error()
+        return None
+
+    def _error(self) -> DataError:
+        return DataError(
+            f"the gyro turns {min(map(abs, self._ratios)):.0f} times as far as the wheels, as in deg/s",
+            channel="imu",
+            remedy="give rad/s",
+        )
+
+    def _far(self) -> bool:
+        return min(self._ratios) > LEAST_RATIO or max(self._ratios) < -LEAST_RATIO
 
     def _compare(self, begin_ns: int, end_ns: int, by_gyro: float, wheels: WheelStream) -> None:
         travelled = wheels.travelled(begin_ns, end_ns)
@@ -64,6 +77,4 @@ class GyroUnit:
         if abs(turn) < LEAST_TURN_RAD:
             return
         self._ratios.append(by_gyro / turn)
-        low, high = min(self._ratios), max(self._ratios)
-        full = len(self._ratios) == WINDOWS
-        self.in_degrees = full and (low > LEAST_RATIO or high < -LEAST_RATIO)
+        self.in_degrees = len(self._ratios) == WINDOWS and self._far()

@@ -40,7 +40,7 @@ def test_other_gyros_are_taken(factor: float) -> None:
     estimator = Estimator.for_vehicle("elevate")
     for message in with_gyro_times(factor):
         estimator.add(message)
-    assert not estimator.gyro._unit.in_degrees
+    assert not estimator.gyro.unit.in_degrees
     assert estimator.latest() is not None
 
 
