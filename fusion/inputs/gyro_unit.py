@@ -19,7 +19,7 @@ class GyroUnit:
     """Compares the turns of gyro and wheels while a robot drives.
 
     Attributes:
-        in_degrees: the last `WINDOWS` turns were those of a gyro in deg/s.
+        in_degrees: the last `WINDOWS` turns were those of a gyro in deg/s, or two before a breakdown.
     """
 
     def __init__(self, track_m: float, sides: bool) -> None:
@@ -77,4 +77,4 @@ class GyroUnit:
         if abs(turn) < LEAST_TURN_RAD:
             return
         self._ratios.append(by_gyro / turn)
-        self.in_degrees = len(self._ratios) == WINDOWS and self._far()
+        self.in_degrees = self._far() and (self.in_degrees or len(self._ratios) == WINDOWS)
