@@ -57,6 +57,13 @@ def test_help(words: str, terrafusion) -> None:
     assert "-h" in outcome.out
 
 
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "terrafusion", "replay", "-h"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.lstrip().startswith("Usage: terrafusion replay")
+
+
 def test_paragraphs_of_help_are_broken_by_the_terminal_alone(terrafusion) -> None:
     lines = terrafusion("init", "-h").out.splitlines()
     first = next(i for i, line in enumerate(lines) if "Lists what the log holds" in line)
