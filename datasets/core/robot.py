@@ -21,6 +21,8 @@ LENGTH_SIGMA_M = {"measured": 0.02, "data_sheet": 0.05}
 DRIVES = ("differential", "skid_steer", "tracked", "ackermann", "four_wheel_steer")
 """How a robot turns: two driven wheels and casters, wheels or tracks that skid, steered front wheels,
 steered front and rear wheels."""
+SKIDDING = ("skid_steer", "tracked")
+"""Those whose wheels or tracks skid in every turn."""
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,10 @@ TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELA
     len(NUMBERS)
 )
 
-GYRO_SCALE_SIGMA, WHEEL_TURN_SIGMA = 0.015, 0.35
-"""Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), and
-the wheels' of a skid-steered robot about its usual value (0.44 to 0.71 measured)."""
+GYRO_SCALE_SIGMA, SKID_TURN_SIGMA, ROLL_TURN_SIGMA = 0.015, 0.35, 0.15
+"""Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), that
+of wheels that skid in a turn about its usual value (0.44 to 0.71 measured), and of wheels that roll (assumed:
+what the file says of track, wheelbase and radii)."""
 BIAS_SIGMA_RADPS = 0.005
 """Least prior of the gyro's bias: data sheets give it at one temperature."""
 WHEEL_SCALE_SIGMA = 0.05
@@ -106,7 +107,7 @@ def assumed(
     """What is known of a robot before it drives; `skids`: its wheels or tracks skid in every turn."""
     sigma = np.array(
         [
-            WHEEL_TURN_SIGMA if yaw_of_wheels else GYRO_SCALE_SIGMA,
+            (SKID_TURN_SIGMA if skids else ROLL_TURN_SIGMA) if yaw_of_wheels else GYRO_SCALE_SIGMA,
             max(bias_sigma_radps, BIAS_SIGMA_RADPS),
             WHEEL_SCALE_SIGMA,
             ANTENNA_SIGMA_M,

@@ -13,13 +13,15 @@ import numpy as np
 from terrafusion.datasets.core.channels import Gnss, Imu
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import SKIDDING
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, planar_spec
 from terrafusion.fusion.graph.preintegration import Preintegrator
 
 IMU_KINDS = ("six_axis", "gyro_z", "none")
-YAW_RATIO = 0.6
-"""True over geometric yaw rate, for skid steer: measured 0.44 to 0.71 (`docs/explanation/planar.md`)."""
+SKID_YAW_RATIO = 0.6
+"""True over geometric yaw rate of robots that skid in a turn: measured 0.44 to 0.71
+(`docs/explanation/planar.md`). Wheels that roll turn the robot by the geometry."""
 COMPLETE_SHARE = 0.5
 """Least share of IMU samples with all six axes for which the log counts as a six-axis one."""
 
@@ -78,9 +80,9 @@ class SensorConfig:
         track = rig.track_m / yaw_factor(rig) if self.yaw == "wheels" else rig.track_m
         return dataclasses.replace(rig, track_m=track, sensors=dataclasses.replace(rig.sensors, imu=imu))
 
-    def preintegrator(self, spec: ImuSpec) -> Preintegrator:
-        """Maker of the link between keyframes."""
-        return PlanarPreintegrator(spec, self.yaw) if self.planar else Preintegrator(spec)
+    def preintegrator(self, spec: ImuSpec, skids: bool = True) -> Preintegrator:
+        """Maker of the link between keyframes of a robot that skids in turns, or not."""
+        return PlanarPreintegrator(spec, self.yaw, skids) if self.planar else Preintegrator(spec)
 
     def notes(self, recording: Recording, rig: Rig) -> tuple[str, ...]:
         """What was assumed of a log of the robot `rig`, in sentences."""
@@ -91,7 +93,7 @@ class SensorConfig:
                 "(taken as level), height only from GNSS"
             )
         if self.yaw == "wheels":
-            source = "assumed for skid steer" if rig.known.yaw_factor is None else "by the vehicle file"
+            source = f"assumed for {rig.drive}" if rig.known.yaw_factor is None else "by the vehicle file"
             notes.append(
                 f"yaw is taken from the wheels: {yaw_factor(rig):g} of what their difference over the track "
                 f"says ({source})"
@@ -108,7 +110,9 @@ class SensorConfig:
 def yaw_factor(rig: Rig) -> float:
     """True over geometric yaw rate of the wheels."""
     known = rig.known.yaw_factor
-    return YAW_RATIO if known is None else known.number
+    if known is not None:
+        return known.number
+    return SKID_YAW_RATIO if rig.drive in SKIDDING else 1.0
 
 
 def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:

@@ -17,7 +17,7 @@ from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.door import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
-from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream, turned
 from terrafusion.fusion.noise.policy import SensorNoise
 
 STILL_MPS = 0.01
@@ -74,11 +74,10 @@ def level_start(imu: ImuStream, wheels: WheelStream, t_ns: int) -> Start:
         gained = _mean_speed_mps(wheels, t_ns + 4 * fifth, t_ns + 5 * fifth) - speed
         yaw_rate = float(gyro[:, 2].mean()) if len(gyro) else 0.0
         mean_speed = 0.5 * sum(rolled or (0.0, 0.0)) / (WINDOW_NS * 1e-9)
-        force = force - np.array([gained / 0.8, mean_speed * yaw_rate, 0.0])
-        # The mean was felt half a second later, by a robot that had turned on.
-        turned = 0.5e-9 * WINDOW_NS * yaw_rate
-        x, y, _ = force
-        force[0], force[1] = x * np.cos(turned) - y * np.sin(turned), x * np.sin(turned) + y * np.cos(turned)
+        if imu.six_axis:  # without an accelerometer the force is that of a level robot
+            force = force - np.array([gained / 0.8, mean_speed * yaw_rate, 0.0])
+            # The mean was felt half a second later, by a robot that had turned on.
+            force = turned(force, 0.5e-9 * WINDOW_NS * yaw_rate)
     x, y, z = force
     return Start(
         t_ns=t_ns,

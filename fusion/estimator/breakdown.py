@@ -55,7 +55,7 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
                 raise ArithmeticError("a state is not finite")
         except CallbackError as passed:
             raise passed.error from None
-        except BREAKDOWN:
+        except BREAKDOWN as error:
             estimator.breakdowns += 1
             unit = estimator.gyro.unit  # what the gyro reports in is still the same
             estimator.reset()
@@ -63,6 +63,6 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
             raise unit.blamed() or DataError(
                 "the sensors contradict each other so far that no state fits them; the estimator starts anew",
                 remedy="check units, axes and vehicle file with `terrafusion inspect`",
-            ) from None
+            ) from error
 
     return guarded

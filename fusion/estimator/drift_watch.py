@@ -94,23 +94,21 @@ class DriftWatch:
 
     def test_wheels(
         self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise, least_m: float
-    ) -> bool:
-        """Refute the wheels where the drift moved too far; True where it did. `sigma_m` is that of a fix,
-        `least_m` the drift's by what the fixes report."""
+    ) -> None:
+        """Refute the wheels where the drift moved too far. `sigma_m` is that of a fix, `least_m` the drift's
+        by what the fixes report."""
         if not self.fresh:
-            return False
+            return
         drift_m = np.array(chain.state(chain.last).linear[DRIFT.start - NAV.stop : DRIFT.stop - NAV.stop])
         P = chain.covariance_at(chain.last)
         t_ns, variance_m2 = chain.nodes[-1].t_ns, 0.5 * float(np.trace(P[DRIFT, DRIFT]))
         self.learn(t_ns, drift_m, variance_m2, least_m)
         moved = self.moved_too_far(t_ns, drift_m, variance_m2)
         if moved is None or P[2, 2] > MOST_YAW_RAD**2:
-            return False
+            return
         since_ns, moved_m = moved
-        if not skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
-            return False
-        self.restart()
-        return True
+        if skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
+            self.restart()
 
     def moved_too_far(self, t_ns: int, drift_m: Array, variance_m2: float) -> tuple[int, Array] | None:
         """Take an estimate in; since when and how far, (2,) m, it moved faster than a receiver drifts.

@@ -23,6 +23,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.robot import SKIDDING
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
@@ -112,7 +113,7 @@ class Estimator:
         self.wheels, self.fixes = WheelStream(self.newest), FixesAhead(self.newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
         self.steering, self._turn = SteeringStream(rig, self.newest), steered_turn(rig, config.inputs)
-        self._preintegrator = config.inputs.preintegrator(rig.sensors.imu)
+        self._preintegrator = config.inputs.preintegrator(rig.sensors.imu, rig.drive in SKIDDING)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
@@ -122,7 +123,6 @@ class Estimator:
         self._set_step(config.keyframe_s)
         self._state: State | None = None
         self._fresh: tuple[State, float, float | None, Array, Array] | None = None  # and the motion to it
-        self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
         self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
@@ -144,7 +144,7 @@ class Estimator:
         """
         if self.config.inputs.imu == "none":
             raise DataError(
-                "the estimator is configured without an IMU", channel="imu", remedy="mend `inputs`"
+                "the estimator is configured without an IMU", channel="imu", remedy="change `inputs`"
             )
         self.imu.add(t_ns, self.gyro.checked(t_ns, gyro_radps, self.wheels), accel_mps2)
         if self._fresh is not None or not self.chain.nodes or self._due() is not None:
@@ -285,7 +285,7 @@ class Estimator:
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
         for chain in filter(None, (self.chain, self.chain.archive)):
             chain.set_prior(sigmas[: chain.dim])
-        self._solve()
+        self.chain.solve(SMOOTH_WINDOW)
         self.weights.begin(start.t_ns)
         newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
         # Live, keyframes before the start are not reported; in a batch they are.
@@ -336,7 +336,8 @@ class Estimator:
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, switch)
         markov = slow_states.step(dt, noise, before.rotation[2], *drift, switch, wheels)
-        self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
+        for stream in (self.imu, self.wheels, self.steering):
+            stream.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
             self.chain.add(k, level_factor(k), "X")
@@ -345,21 +346,23 @@ class Estimator:
         self._fresh = self._finish_keyframe(t_ns, gyro, rolled_m), dt, None if gap else rolled_m, gyro, accel
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> State:
-        chain, before = self.chain, self._solve()
-        if chain.archive is None:  # nobody drives by a batch
+        chain = self.chain
+        chain.solve(SMOOTH_WINDOW)
+        before = chain.covariance()
+        if chain.archive is None:  # a batch needs no odometry frame
             self._frame.step(chain)
-        if self.gnss.update(chain, before, self.weights.noise):
-            self._solve()
+        if self.gnss.update(chain, self.weights.noise):
+            chain.solve(SMOOTH_WINDOW)
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
-            self._solve()
+            chain.solve(SMOOTH_WINDOW)
         chain.forget(self._keep)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         return self._emitted(t_ns, gyro)
 
-    def _solve(self) -> Array:
-        self.chain.solve(SMOOTH_WINDOW)
-        self._covariance = self.chain.covariance()
-        return self._covariance
+    @property
+    def _covariance(self) -> Array:
+        """Marginal covariance (dim, dim) of the newest keyframe."""
+        return self.chain.covariance()
 
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
@@ -367,8 +370,7 @@ class Estimator:
         if fresh is None:
             return
         state, dt, rolled_m, gyro, accel = fresh
-        if self.learned.keyframe(self.chain, dt, rolled_m, gyro, accel):
-            self._covariance = self.chain.covariance()
+        self.learned.keyframe(self.chain, dt, rolled_m, gyro, accel)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)
@@ -376,10 +378,8 @@ class Estimator:
             self.learned.heading_turned()
         if turned or self.chain.last % SMOOTH_EVERY == 0:
             self.chain.smooth(SMOOTH_WINDOW)
-            self._covariance = self.chain.covariance()
         self.weights.update(state, self.imu, self.wheels, self._skid.friction)
-        if self.learned.advance(self.chain):
-            self._covariance = self.chain.covariance()
+        self.learned.advance(self.chain)
 
     def _wheel_increment(
         self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState
@@ -429,7 +429,7 @@ class Estimator:
     def _emitted(self, t_ns: int, gyro: Array) -> State:
         key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
         outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
-        gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.noise)
+        gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),

@@ -33,7 +33,8 @@ LEAST_SIGMA_M = 0.005
 KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 """Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
-UNKNOWN_HEIGHT_SIGMA_M = 100.0
+UNKNOWN_HEIGHT_SIGMA_M = 1e6
+"""1 sigma of a height that is not known: no number of such fixes may come to tell one."""
 UNKNOWN_CLIMB_MPS = 100.0
 """1 sigma of the upward velocity of a receiver that reports speed and course alone."""
 UNUSED_WEIGHT = 0.01
@@ -158,15 +159,13 @@ class GnssUpdater:
         self._seen = len(self.waiting)
         return changed
 
-    def update(self, chain: Chain, covariance: Array, noise: SensorNoise) -> bool:
+    def update(self, chain: Chain, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is that of the newest
-        keyframe.
+        A fix belongs to the first keyframe after it.
         """
         used = False
-        if self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise, self._least_drift_m):
-            covariance = chain.covariance_at(chain.last)
+        self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise, self._least_drift_m)
         self.track.step(chain, self.skid.rate_m2ps > 0.0)
         self.plausible.watch(chain.nodes[-1].t_ns)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
@@ -178,7 +177,7 @@ class GnssUpdater:
                 self.unaligned += 1
                 self.track.add(fix)
                 used |= self._align(chain, fix)
-            elif self._implausible(chain, k, fix, covariance):
+            elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:
                 if self._pair is not None:
@@ -191,8 +190,7 @@ class GnssUpdater:
                 restarted = self._change_class(chain, k, fix)
                 if restarted or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
-                    covariance = chain.covariance_at(k)
-                used |= self._add_fix(chain, k, fix, covariance, noise)
+                used |= self._add_fix(chain, k, fix, noise)
                 if self._pair is None or self._pair.usable:
                     self._unchecked = fix
         self.drift_watch.fresh = used and self._share >= LEAST_SHARE
@@ -200,7 +198,7 @@ class GnssUpdater:
             self.weighting.revisit(chain)
         return used
 
-    def _implausible(self, chain: Chain, k: int, fix: GnssFix, covariance: Array) -> bool:
+    def _implausible(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Whether a fix must not be used whatever the gate says of it."""
         self._pair, place = self.track.pair(fix), self._antenna(chain, k)
         if self._pair is None:
@@ -212,7 +210,8 @@ class GnssUpdater:
             self.track.keep(self._pair)
         off = self._pair.fix - place
         innovation = np.array([off.real, off.imag])
-        S = covariance[3:5, 3:5] + np.diag(fix.sigma_m[:2] ** 2)
+        R = chain.state(k).rotation[:2]
+        S = R @ chain.covariance_at(k)[3:6, 3:6] @ R.T + np.diag(fix.sigma_m[:2] ** 2)
         nis = normalised_square(innovation, S)
         self._report(Innovation(fix.t_ns, "gnss", np.append(innovation, np.nan), nis, 2, False, refused))
         return True
@@ -316,10 +315,9 @@ class GnssUpdater:
         self.turned += 1
         return True
 
-    def _add_fix(
-        self, chain: Chain, k: int, fix: GnssFix, covariance: Array, noise: SensorNoise, again: bool = False
-    ) -> bool:
+    def _add_fix(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise, again: bool = False) -> bool:
         state, at = chain.state(k), AntennaMotion.of(chain, k, fix, self.antenna_m)
+        covariance = chain.covariance_at(k)
         inflation = noise.gnss_inflation * self.scale
         share = self._share = self._drift_share(fix, inflation)
         # The fix is carried to its keyframe by the speed as it is known now.
@@ -339,7 +337,7 @@ class GnssUpdater:
         verdict, nis = self._gated(chain, k, innovation[:2], P[:2, :2])
         slid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
         if slid and not again and self._test_wheels(chain, k, fix, noise):
-            return self._add_fix(chain, k, fix, chain.covariance_at(k), noise, again=True)
+            return self._add_fix(chain, k, fix, noise, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not GateDecision.REACQUIRE:
             drift_m2 = (share * self.drift_sigma_m) ** 2

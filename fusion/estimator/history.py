@@ -57,8 +57,10 @@ class History:
         batch.optimise()
         keys, covariances = batch.states(), batch.covariances()
         offset = len(keys) - len(self.states)
-        imu, keyframe_s = config.rig.sensors.imu, config.keyframe_s
-        sigma_radps = np.array([gyro_sigma_radps(imu, keyframe_s, noise) for noise in self.noises])
+        imu, t_s = config.rig.sensors.imu, np.array([key.t_ns for key in self.states]) * 1e-9
+        apart_s = np.diff(t_s, prepend=t_s[0] - config.keyframe_s)
+        pairs = zip(self.noises, apart_s, strict=True)
+        sigma_radps = np.array([gyro_sigma_radps(imu, dt_s, noise) for noise, dt_s in pairs])
         self.states = smoothed(self.states, live, keys[offset:], covariances[offset:], sigma_radps)
         if aligned:
             self.states = [

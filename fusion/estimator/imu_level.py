@@ -65,7 +65,6 @@ class ImuLevel:
         """Begin with what is known of the robot."""
         self.before = self.known = before
         self.corrects, self._held = [False, False], False
-        self._back: Array | None = None
         self._level()
 
     def _level(self) -> None:
@@ -120,8 +119,9 @@ class ImuLevel:
         if self._held:
             return False
         state = chain.state(chain.last)
-        if self._back is not None:
-            gyro_radps, accel_mps2 = self._back @ gyro_radps, self._back @ accel_mps2
+        back = self._back(self._imu.mounting_rad)
+        if back is not None:
+            gyro_radps, accel_mps2 = back @ gyro_radps, back @ accel_mps2
         self._new |= self._seen.add(dt_s, rolled_m * state.rolling / dt_s, gyro_radps, accel_mps2)
         if not self._new:
             return False
@@ -135,6 +135,15 @@ class ImuLevel:
             return False
         self._turn(chain, yaw, abs(complex(*self._angles()) - was))
         return True
+
+    def _back(self, yaw_rad: float) -> Array | None:
+        """Rotation (3, 3) of readings levelled by what is known now to those levelled by what was
+        known before the drive; None where it is the same."""
+        if all(now.rad == before.rad for now, before in zip(self.known, self.before, strict=True)):
+            return None
+        first, now = (_rotation(angles) for angles in (self.before, self.known))
+        about = gtsam.Rot3.Rz(yaw_rad).matrix()
+        return np.asarray(about @ first @ now.T @ about.T)
 
     def _angles(self) -> tuple[float, float]:
         roll, pitch = self.known
@@ -167,15 +176,9 @@ class ImuLevel:
         have made one of the tilt; heading, place and velocity stay. The height is in doubt by `step_rad` of
         the distance driven.
         """
-        was = self._imu.level
+        was, about = self._imu.level, gtsam.Rot3.Rz(yaw_rad).matrix()
         self._level()
-        about = gtsam.Rot3.Rz(yaw_rad).matrix()
-        first, old, new = (
-            np.eye(3) if level is None else level
-            for level in (level_rotation(*(angle.rad for angle in self.before)), was, self._imu.level)
-        )
-        self._back = about @ first @ new.T @ about.T
-        turned = about @ new @ old.T @ about.T
+        turned = about @ _rotation(self.known) @ (np.eye(3) if was is None else was.T) @ about.T
         state = chain.state(chain.last)
         up = state.rotation[2]
         force = turned @ (GRAVITY_MPS2 * up + state.bias.accelerometer())
@@ -191,6 +194,13 @@ class ImuLevel:
         doubt[:2], doubt[VELOCITY.stop - 1] = DOUBTFUL_RAD**2, DOUBTFUL_CLIMB_MPS**2
         doubt[5], doubt[BIAS] = (step_rad * self._seen.driven_m) ** 2, self._bias_sigma**2
         chain.restart(doubt, at=point)
+
+
+def _rotation(level: tuple[Angle, Angle]) -> Array:
+    """As `level_rotation`, of the angles in use."""
+    roll, pitch = level
+    rotation = level_rotation(roll.rad, pitch.rad)
+    return np.eye(3) if rotation is None else rotation
 
 
 def _priors(known: SensorNumbers) -> tuple[Angle, Angle]:

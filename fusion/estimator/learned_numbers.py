@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.robot import SensorNumbers
+from terrafusion.datasets.core.robot import SKIDDING, SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
@@ -41,9 +41,9 @@ from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 
-SKIDDING, GROUND_LAG_SIGMA_S = ("skid_steer", "tracked"), 0.1
-"""Drives whose wheels skid in every turn, and the spread of their course lag between grounds (assumed; a
-Warthog's is 0.0 s on sand, 0.1 to 0.3 s on asphalt, grass and gravel: study `course_lag`)."""
+GROUND_LAG_SIGMA_S = 0.1
+"""Spread of the course lag between grounds (assumed; a Warthog's is 0.0 s on sand, 0.1 to 0.3 s on asphalt,
+grass and gravel: study `course_lag`)."""
 SLIP_SPREAD = 0.05
 """Spread of slip between stretches of some tens of metres before any is driven (assumed)."""
 LEAST_SLIP_SIGMA = 0.02

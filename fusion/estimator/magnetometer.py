@@ -198,7 +198,7 @@ class MagnetometerAiding:
         if not self.ready or level.gyro_bias_radps is None:
             return None
         still = [(t, field) for t, field in self._samples if 0 <= t - level.t_ns <= WINDOW_NS]
-        if len(still) < LEAST_START:  # those of later may be of a robot that turns by after_rad2
+        if len(still) < LEAST_START:  # those of later may be of a robot that turns by then
             return None
         mean = np.mean([field for _, field in still], axis=0)
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, 0.0).matrix()
@@ -312,7 +312,7 @@ class MagnetometerAiding:
             sigma, DECLINATION_SIGMA_RAD
         ):
             notes.append(
-                f"magnetometer: the declination given is disabled by {math.degrees(astray):.0f} deg "
+                f"magnetometer: the declination given is off by {math.degrees(astray):.0f} deg "
                 f"(1 sigma {math.degrees(sigma):.0f}), or the robot's iron turns its heading"
             )
         iron = self.bias.mean[1:]

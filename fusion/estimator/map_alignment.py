@@ -22,7 +22,7 @@ from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.inputs.streams import GnssFix
 
 PLACE = (2, 3, 4, 5)
-"""Tangent of heading and position: what a local frame leaves open."""
+"""Tangent of heading and position: what a local frame leaves open; the last is the height."""
 YAW_SIGMA_RAD = 0.25
 """What the window's linearisation bears; further fixes reduce it (assumed)."""
 UPRIGHT = 0.99
@@ -80,19 +80,20 @@ def align_to_map(
     doubt = np.zeros(chain.dim)
     doubt[2] = fit.sigma_rad**2
     doubt[3:5] = reported_m**2 + fit.residual_m**2 + (fit.sigma_rad * away_m) ** 2
-    doubt[5] = float(fix.sigma_m[2]) ** 2 if known else OPEN_M**2
+    doubt[5] = float(fix.sigma_m[2]) ** 2 if known else 0.0
     doubt[DRIFT] = drift_sigma_m**2
+    opened = PLACE if known else PLACE[:3]  # fixes without height leave that of the start as it is
     alignment = MapAlignment(fix.t_ns, track.error_of(fit), antenna, to_m)
     drop_local_factors(chain.nodes)
-    chain.restart(doubt, chain.first, PLACE)
+    chain.restart(doubt, chain.first, opened)
     chain.turn(alignment.yaw_rad, alignment.from_m, alignment.to_m)
     chain.smooth(len(chain.nodes))
     if chain.archive is not None:
         drop_local_factors(chain.archive.nodes)
         chain.archive.turn(alignment.yaw_rad, alignment.from_m, alignment.to_m)
         prior = chain.archive.nodes[0].prior
-        prior[PLACE, :] = 0.0
-        prior[PLACE, PLACE] = 1.0 / np.array([OPEN_YAW_RAD, *[OPEN_M] * 3])
+        prior[opened, :] = 0.0
+        prior[opened, opened] = 1.0 / np.array([OPEN_YAW_RAD, OPEN_M, OPEN_M, OPEN_M])[: len(opened)]
     track.restart()
     return alignment
 

@@ -26,6 +26,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import covariance_fields, key_state_of
 from terrafusion.fusion.graph.key_state import DIM, NAV, quaternion_of, skew
+from terrafusion.fusion.graph.planar import with_centripetal_force
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -52,15 +53,19 @@ class Propagator:
             return state
         if self._state is not state or self._taken(imu) != self._count:
             self._begin(state, covariance, noise)
-        for segment in imu.segments(self._until_ns, newest_ns):
+        segments = imu.segments(self._until_ns, newest_ns)
+        if not imu.six_axis:
+            segments = with_centripetal_force(segments, self._key)
+        for segment in segments:
             self._measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
             self._readings += segment.dt_s * np.array([segment.gyro_radps, segment.accel_mps2])
         self._until_ns = newest_ns
         self._count = self._taken(imu)
         density = np.array(noise.gyro_axes()) * self._preintegrator.spec.gyro_noise_radps_sqrthz
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
-        gyro = np.where(np.isfinite(imu.gyro[-1]), imu.gyro[-1], state.gyro_bias_radps)  # none: no rate
-        return self._carried(state, gyro, density / math.sqrt(interval_s))
+        if segments:
+            self._gyro = segments[-1].gyro_radps
+        return self._carried(state, self._gyro, density / math.sqrt(interval_s))
 
     def _taken(self, imu: ImuStream) -> int:
         """Number of samples between keyframe and `_until_ns`: it changes when a late one comes."""

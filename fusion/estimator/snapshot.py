@@ -113,8 +113,8 @@ def restore(fresh: R, data: bytes) -> R:
         RuntimeError,
         TypeError,
         ValueError,
-    ):
-        raise _corrupt("its parts do not fit together") from None
+    ) as error:
+        raise _corrupt("its parts do not fit together") from error
     return fresh
 
 

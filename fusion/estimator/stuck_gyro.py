@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.config.sensor_config import YAW_RATIO, SensorConfig
+from terrafusion.fusion.config.sensor_config import SensorConfig, yaw_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.door import as_numbers, checked_time
 from terrafusion.fusion.inputs.gyro_unit import GyroUnit
@@ -39,7 +39,7 @@ class StuckGyro:
         self.stuck = False
         self.samples = 0
         self.doubt_rad = 0.0
-        self._track_m, self._density = rig.track_m / YAW_RATIO, rig.sensors.imu.gyro_noise_radps_sqrthz
+        self._track_m, self._density = rig.track_m / yaw_factor(rig), rig.sensors.imu.gyro_noise_radps_sqrthz
         self._sides = inputs.sides
         self.unit = GyroUnit(rig.track_m, inputs.sides)
         self._reading = float("nan")
@@ -74,7 +74,7 @@ class StuckGyro:
         least = DISAGREE_RADPS if lasts_ns < 4 * STUCK_NS else DISAGREE_LONG_RADPS
         if not self.stuck and off > least + DISAGREE_SHARE * min(abs(turning), abs(reading)):
             self.stuck = True
-            self.doubt_rad = 2e-9 * off * STUCK_NS
+            self.doubt_rad = 1e-9 * off * lasts_ns
         if not self.stuck:
             return gyro
         self.samples += 1

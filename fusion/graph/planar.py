@@ -33,8 +33,8 @@ TILT_SIGMA_RAD = 0.1
 """Roll and pitch of ground taken for level, 1 sigma (assumed)."""
 TILT_DENSITY_RADPS = 0.1
 """Change of the ground's tilt, rad/s/sqrt(Hz) (assumed): 0.03 rad (1 sigma) per keyframe."""
-TURN_SHARE = 0.4
-"""Relative error of the wheels' yaw rate (1 sigma, assumed)."""
+SKID_TURN_SHARE, ROLL_TURN_SHARE = 0.4, 0.1
+"""Relative error of the yaw rate of wheels that skid in a turn, and that roll (1 sigma, assumed)."""
 TURN_TIME_S = 10.0
 """Correlation time of that error, s (assumed): a long turn."""
 WHEEL_YAW_DENSITY_RADPS = 0.02
@@ -109,11 +109,12 @@ class PlanarPreintegrator(Preintegrator):
     Args:
         spec: noise of the gyro, where yaw is the gyro's.
         yaw: source of the yaw rate: "gyro", "steering", "wheels" or "nobody".
+        skids: whether the wheels skid in a turn.
     """
 
-    def __init__(self, spec: ImuSpec, yaw: str) -> None:
+    def __init__(self, spec: ImuSpec, yaw: str, skids: bool = True) -> None:
         super().__init__(spec)
-        self.yaw = yaw
+        self.yaw, self._turn_share = yaw, SKID_TURN_SHARE if skids else ROLL_TURN_SHARE
 
     def params(self, segments: list[ImuSegment], noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
         """Noise of the segments; of `noise` only the inflation about yaw acts."""
@@ -139,7 +140,7 @@ class PlanarPreintegrator(Preintegrator):
         share, floor = (
             (STEERED_TURN_SHARE, STEERED_YAW_DENSITY_RADPS)
             if steered
-            else (TURN_SHARE, WHEEL_YAW_DENSITY_RADPS)
+            else (self._turn_share, WHEEL_YAW_DENSITY_RADPS)
         )
         return float(np.hypot(share * rate_radps * np.sqrt(TURN_TIME_S), floor))
 

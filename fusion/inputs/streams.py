@@ -145,9 +145,9 @@ class ImuStream:
     Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
     place the readings of a robot that drives straight on level ground.
 
-    `turn_scale` is the true over the measured yaw rate, less one, and `mounting_rad` the angle about z at
-    which the IMU is mounted; `segments` and `levelled` correct them. `level` (3, 3) turns the samples of a
-    tilted IMU as they come.
+    `level` (3, 3) turns the readings of a tilted IMU into the level, `turn_scale` is the true over the
+    measured yaw rate, less one, and `mounting_rad` the angle about z at which the IMU is mounted. Samples are
+    held as measured; `segments`, `levelled` and `window` correct them by what is known when they are called.
 
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
@@ -187,8 +187,6 @@ class ImuStream:
         if beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2):
             self.impossible += 1
             return
-        if self.level is not None:
-            gyro, accel = self.level @ gyro, self.level @ accel
         for sample in self.late.leap.admitted((t_ns, gyro, accel)):
             self._insert(*sample)
 
@@ -233,25 +231,28 @@ class ImuStream:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
         i = bisect.bisect_right(self.t_ns, start_ns)
         segments, t = [], start_ns
-        corrected = not self.six_axis or self.turn_scale != 0.0 or self.mounting_rad != 0.0
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
                 held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
-                readings = self.gyro[i], self.accel[i]
-                if corrected:
-                    readings = self._for_graph(*readings)
+                readings = self._for_graph(self.gyro[i], self.accel[i])
                 segments.append(ImuSegment((until - t) * 1e-9, *readings, *held))
             t = until
             i += 1
         return segments
 
     def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
-        scale = 1.0 + self.turn_scale
-        if not self.six_axis:
-            return np.array([0.0, 0.0, scale * gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
-        if scale != 1.0:
-            gyro = np.array([gyro[0], gyro[1], scale * gyro[2]])
+        if self.six_axis:
+            return self._corrected(gyro, accel)
+        yaw_rate = (1.0 + self.turn_scale) * gyro[2]
+        return np.array([0.0, 0.0, yaw_rate]), np.array([0.0, 0.0, GRAVITY_MPS2])
+
+    def _corrected(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
+        """Readings (..., 3) by body axes, with their turns as they are."""
+        if self.level is not None:
+            gyro, accel = gyro @ self.level.T, accel @ self.level.T
+        if self.turn_scale:
+            gyro = gyro * np.array([1.0, 1.0, 1.0 + self.turn_scale])
         if self.mounting_rad:
             gyro, accel = turned(gyro, self.mounting_rad), turned(accel, self.mounting_rad)
         return gyro, accel
@@ -259,8 +260,11 @@ class ImuStream:
     def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
         _, gyro, accel = self.window(start_ns, end_ns)
-        rows = [self._for_graph(g, a) for g, a in zip(gyro, accel, strict=True)]
-        return np.array([g for g, _ in rows]).reshape(-1, 3), np.array([a for _, a in rows]).reshape(-1, 3)
+        if self.six_axis:
+            return gyro, accel
+        yaw_rate = np.zeros(gyro.shape)
+        yaw_rate[:, 2] = gyro[:, 2]
+        return yaw_rate, np.tile([0.0, 0.0, GRAVITY_MPS2], (len(gyro), 1))
 
     def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
         """Longest time between samples that touch the interval, s."""
@@ -270,10 +274,11 @@ class ImuStream:
         return max((b - a for a, b in itertools.pairwise(times)), default=0) * 1e-9
 
     def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
-        """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end, as measured."""
+        """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end, body axes."""
         i, j = bisect.bisect_left(self.t_ns, start_ns), bisect.bisect_left(self.t_ns, end_ns)
         t = np.array([x - start_ns for x in self.t_ns[i:j]], dtype=float) * 1e-9
-        return t, np.array(self.gyro[i:j]).reshape(-1, 3), np.array(self.accel[i:j]).reshape(-1, 3)
+        gyro, accel = (np.array(held[i:j]).reshape(-1, 3) for held in (self.gyro, self.accel))
+        return t, *self._corrected(gyro, accel)
 
     def forget(self, before_ns: int) -> None:
         """Drop samples older than `before_ns`, in blocks so that it stays cheap."""
@@ -284,11 +289,10 @@ class ImuStream:
                 times[:] = [t for t in times if t >= before_ns]
 
 
-def turned(vector: Array, angle_rad: float) -> Array:
-    """A vector (3,) turned about z."""
+def turned(vectors: Array, angle_rad: float) -> Array:
+    """Vectors (..., 3) turned about z."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
-    x, y, z = vector
-    return np.array([c * x - s * y, s * x + c * y, z])
+    return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 class WheelStream:

@@ -204,3 +204,18 @@ def test_an_estimator_restored_before_the_fixes_is_aligned_with_the_same_bits() 
     for a, b in zip(whole, broken, strict=True):
         assert (a.position_m == b.position_m).all()
         assert (a.covariance == b.covariance).all()
+
+
+def test_fixes_without_height_leave_height_and_horizontal_sigma_alone() -> None:
+    """On a slope an unknown height would otherwise be an unknown place."""
+    drive = simulate("figure_eight", terrain="asphalt", slope_deg=5.0, seed=100)
+    gnss = drive.gnss
+    assert gnss is not None
+    flat = dataclasses.replace(gnss, enu_m=gnss.enu_m * [1.0, 1.0, np.nan])
+    late = flat.select(gnss.t_ns > drive.start_ns + round(WITHOUT_S * 1e9))
+    estimate = replay(until(dataclasses.replace(drive, gnss=late), 75.0)).estimate
+    mapped = estimate.status != "no_gnss"
+    covariance = estimate.trajectory.covariance
+    assert covariance is not None
+    assert np.sqrt(covariance[mapped][:, [0, 1], [0, 1]].max()) < 5.0
+    assert np.abs(np.diff(estimate.trajectory.position_m[mapped, 2])).max() < 0.5

@@ -13,6 +13,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.key_states import key_state_of
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.graph.key_state import IMU_ROTATION, LINEAR, NAV, KeyState
 from terrafusion.fusion.inputs.streams import ImuStream
@@ -77,3 +78,47 @@ def test_a_gyro_of_one_axis_tells_no_other_rate() -> None:
         made.add_imu(i * 10**7, [np.nan, np.nan, 0.1])
     assert made.odometry().t_ns > made.latest().t_ns
     assert np.isfinite(made.odometry().angular_velocity_radps).all()
+
+
+@pytest.fixture(scope="module")
+def turning() -> Estimator:
+    """A robot of a gyro of one axis, that drives at 1.5 m/s and turns at 0.8 rad/s."""
+    inputs = SensorConfig(imu="gyro_z")
+    made = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=inputs))
+    made.set_start([0.0, 0.0, 0.0], 0.0)
+    half = 0.4 * load_vehicle("elevate").body.track_m
+    for i in range(409):
+        made.add_wheels(i * 10**7, 1.5 - half, 1.5 + half)
+        made.add_imu(i * 10**7, [np.nan, np.nan, 0.8])
+    return made
+
+
+def test_without_an_accelerometer_the_velocity_turns_with_the_robot(turning: Estimator) -> None:
+    state, now = turning.latest(), turning.odometry()
+    assert now.t_ns - state.t_ns > 5 * 10**7
+    before, after = (key_state_of(one) for one in (state, now))
+    assert after.rotation.T @ after.velocity == pytest.approx(before.rotation.T @ before.velocity, abs=0.01)
+
+
+def test_the_rate_is_that_of_the_robot_as_in_a_keyframe(turning: Estimator) -> None:
+    imu = ImuStream()
+    imu.mounting_rad, imu.turn_scale = np.pi, 0.1
+    state = dataclasses.replace(turned(turning.latest()), linear=np.zeros(len(LINEAR)))
+    for i in range(10):
+        imu.add(state.t_ns + i * 10**7, [0.02, 0.0, 0.2], [0.0, 0.0, GRAVITY_MPS2])
+    covariance = 1e-4 * np.eye(turning.chain.dim)
+    propagator = Propagator(turning._preintegrator)
+    for _ in range(2):
+        found = propagator.carry(state, covariance, imu, turning.weights.noise)
+        assert found.angular_velocity_radps == pytest.approx([-0.02, 0.0, 0.22])
+
+
+def test_samples_are_levelled_by_what_is_known_when_they_are_used() -> None:
+    imu = ImuStream()
+    for i in range(10):
+        imu.add(i * 10**7, [0.0, 0.0, 0.2], [0.0, 0.0, GRAVITY_MPS2])
+    imu.level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    assert imu.segments(0, 10**7)[0].gyro_radps == pytest.approx([0.0, -0.2, 0.0])
+    _, gyro, accel = imu.window(0, 10**7)
+    assert gyro[0] == pytest.approx([0.0, -0.2, 0.0])
+    assert accel[0] == pytest.approx([0.0, -GRAVITY_MPS2, 0.0])

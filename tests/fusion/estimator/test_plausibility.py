@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
@@ -30,7 +30,7 @@ from terrafusion.fusion.estimator.plausibility import (
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import WheelStream
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
@@ -272,3 +272,15 @@ def test_a_gyro_at_rest_or_in_order_is_not_stuck() -> None:
         wheels.add(i * 10**7, -0.1, 0.1)
         check.checked(i * 10**7, [0.0, 0.0, -0.4 + 1e-4 * rng.normal()], wheels)
     assert check.samples == 0, "a reading that changes is that of a gyro"
+
+
+@pytest.mark.parametrize(("drive", "share"), [("differential", 1.0), ("skid_steer", 0.6)])
+def test_the_stand_in_turns_as_far_as_the_wheels_of_its_drive(drive: str, share: float) -> None:
+    vehicle = with_overrides(load_vehicle("elevate"), Overrides(drive=drive))
+    wheels, check = WheelStream(), StuckGyro(vehicle.rig(), SensorConfig())
+    half = 0.5 * vehicle.body.track_m
+    for i in range(100):
+        wheels.add(i * 10**7, -half, half)
+        given = check.checked(i * 10**7, [0.0, 0.0, 0.0], wheels)
+    assert given[2] == pytest.approx(share)
+    assert check.doubt_rad == pytest.approx(0.5 * share, abs=0.02), "by what it was wrong for half a second"

@@ -14,22 +14,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, wrap_angle
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples, sensor_config_of
+from terrafusion.fusion.config.sensor_config import (
+    SensorConfig,
+    complete_samples,
+    sensor_config_of,
+    yaw_factor,
+)
+from terrafusion.fusion.estimator.alignment import level_start
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.simulate import simulate
 
 REDUCED = ("gyro z", "no accelerometer", "no imu", "body speed")
@@ -325,3 +332,49 @@ def test_the_command_on_a_reduced_log_folder(exact: Recording, tmp_path: Path, w
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["ate_m"] < (0.5 if what == "body speed" else 0.02)
     assert "planar graph" in json.dumps(metrics)
+
+
+def rolling(drive: str, mean_mps: float = 1.0) -> Recording:
+    """A robot of wheels that roll without slip through bends to both sides, without an IMU; 1 m fixes."""
+    vehicle = with_overrides(load_vehicle("elevate"), Overrides(drive=drive))
+    t_ns = np.arange(0, 120 * 50) * 20_000_000
+    rate = 0.5 * np.sin(2e-9 * np.pi * t_ns / 20.0)
+    yaw = np.cumsum(rate) * 0.02
+    xy = np.cumsum(mean_mps * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0) * 0.02
+    half = 0.5 * vehicle.body.track_m * rate
+    speeds = np.column_stack([mean_mps - half, mean_mps + half])
+    place = np.column_stack([xy, np.zeros(len(xy))])
+    fixes = place[::10] + np.random.default_rng(0).normal(size=(len(place[::10]), 3))
+    fixes[:, 2] = 0.0
+    gnss = Gnss(t_ns[::10], fixes, np.ones_like(fixes), np.full(len(fixes), int(Fix.SINGLE), dtype=np.uint8))
+    quaternion = np.column_stack([np.zeros((len(yaw), 2)), np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
+    return Recording(
+        "rolling", start_ns=0, wheels=Wheels(t_ns, speeds, ("left", "right"), "mps"), gnss=gnss,
+        truth=Trajectory(t_ns, place, quaternion),
+        overrides=Overrides(drive=drive, track_m=vehicle.body.track_m),
+    )  # fmt: skip
+
+
+def test_wheels_that_roll_turn_the_robot_by_the_geometry() -> None:
+    """Without an IMU from the first fix on, whereas wheels that skid turn it by less."""
+    rig = with_overrides(load_vehicle("elevate"), Overrides(drive="differential")).rig()
+    assert yaw_factor(rig) == 1.0
+    assert yaw_factor(load_vehicle("elevate").rig()) < 0.8
+    result = replay(rolling("differential"), outages=[Outage(40.0, 30.0)])
+    end_m = result.scores.outages[0].end_error_m
+    assert end_m is not None
+    assert end_m < 2.0
+    assert any("1 of what their difference" in note for note in result.estimate.notes)
+
+
+@pytest.mark.parametrize(("speeds", "yaw_rate"), [((2.0, 2.0), 0.8), ((1.0, 2.5), 0.0)])
+def test_a_start_in_motion_without_an_accelerometer_is_level(
+    speeds: tuple[float, float], yaw_rate: float
+) -> None:
+    imu, wheels = ImuStream(six_axis=False), WheelStream()
+    for i in range(120):
+        speed = np.interp(i, (0, 100), speeds)
+        imu.add(i * 10**7, [np.nan, np.nan, yaw_rate], [np.nan] * 3)
+        wheels.add(i * 10**7, speed, speed)
+    start = level_start(imu, wheels, 0)
+    assert (start.roll_rad, start.pitch_rad) == pytest.approx((0.0, 0.0), abs=1e-9)

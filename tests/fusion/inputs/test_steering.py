@@ -132,3 +132,17 @@ def test_without_a_gyro_the_steering_turns_the_path() -> None:
     yaw = np.unwrap(np.arctan2(*np.diff(path[::5, 1::-1], axis=0).T))
     assert np.ptp(yaw) > 0.4  # the wave of the heading, 2 x 0.4 x 7 / 2 pi
     assert any("steering angles" in note for note in result.estimate.notes)
+
+
+def test_a_late_angle_does_not_turn_back_the_clock_of_all_sensors() -> None:
+    estimator = Estimator(EstimatorConfig(rig(), "elevate", inputs=SensorConfig(steered=True)))
+    estimator.set_start([0.0, 0.0, 0.0], 0.0)
+    for i in range(400):
+        estimator.add_wheels(i * S // 100, 1.0, 1.0)
+        estimator.add_imu(i * S // 100, [0.0, 0.0, 0.0], [0.0, 0.0, 9.80665])
+        if i % 80 == 0:
+            estimator.add_steering(i * S // 100, 0.0)
+    newest, known = estimator.newest.t_ns, list(estimator.steering.t_ns)
+    estimator.add_steering(newest - 3 * S // 2, 0.0)
+    assert estimator.newest.t_ns == newest
+    assert estimator.steering.t_ns == known
