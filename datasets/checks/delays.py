@@ -60,6 +60,7 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
         off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
         if off:
             precise = {p for p, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[p]}
+            off |= {p: lags[p] for p in precise - set(off) if _confirms(p, lags[p], off)}
             yield offset_finding(corrected.recording, off, precise | set(off))
         elif not dragged:
             yield from _late_fixes(corrected)
@@ -92,14 +93,28 @@ def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
     return lags, dragged
 
 
+def _confirms(pair: Pair, lag: Lag, off: dict[Pair, Lag]) -> bool:
+    """Whether a lag, too small to matter alone, is that of a channel that is off against another one, too."""
+    for name in pair:
+        for other, found in off.items():
+            if name not in other:
+                continue
+            same = (name == pair[1]) == (name == other[1])
+            seconds = found.seconds if same else -found.seconds
+            if lag.low_s <= seconds <= lag.high_s and _distance_to_zero_s(lag) > 0.5 * abs(seconds):
+                return True
+    return False
+
+
 def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
     model = path_model(context, path_by(context.recording, "gnss"))
     if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SIGNIFICANT_S):
         return
     late = model.delay_s
+    beyond = min(abs(late.low), abs(late.high)) > CALIBRATED_S
     yield Finding(
-        "clock-offset", "warning", "gnss",
+        "clock-offset", "error" if beyond else "warning", "gnss",
         f"its times are {abs(late.value):.2f} s {'late' if late.value > 0 else 'early'} "
         "against wheels and imu",
         f"95 % interval {late.low:.2f} to {late.high:.2f} s, by the path in {model.windows} stretches",

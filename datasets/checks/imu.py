@@ -51,6 +51,9 @@ WINDOW_S, SMOOTH_S = 0.5, 8.0
 """Motion is compared over the first, less its mean over the second: slopes and biases change slowly."""
 LEAST_C, SIGMAS = 0.25, 5.0
 """A correlation counts above the first, and above this many standard errors of noise."""
+MOSTLY, MORE = 0.8, 0.5
+"""Net way backwards over the way rolled, above which wheels run backwards nearly all the time, and above
+which they, not the IMU, are taken to stand the wrong way round (assumed)."""
 NEAR_AXIS = np.radians(25.0)
 SIGNIFICANT_TURN = np.radians(12.0)
 """Slopes, and lever arms of the IMU, seem to turn those of good field logs by up to 8 deg."""
@@ -289,6 +292,14 @@ def wheels_turn_backwards(context: CheckContext) -> bool:
     return axis == "-z" or (axis is None and driven is not None and float(driven[1].mean()) < 0.0)
 
 
+def backwards_share(context: CheckContext) -> float | None:
+    """Net way backwards by the wheels over the way rolled; None where a command says which way it was."""
+    driven = motion.wheel_speed(context)
+    if driven is None or context.recording.command is not None or not driven[1].any():
+        return None
+    return -float(driven[1].sum() / np.abs(driven[1]).sum())
+
+
 def check_axes(context: CheckContext) -> Iterator[Finding]:
     """Gravity must be along +z, and the specific force must answer the wheels along +x and +y."""
     mean, imu = gravity(context), context.recording.imu
@@ -317,7 +328,7 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     if abs(angle) < 0.25 * np.pi and not sure:
         return
     quarter = round(angle / (0.5 * np.pi)) % 4
-    if quarter == 2 and wheels_turn_backwards(context):
+    if quarter == 2 and (wheels_turn_backwards(context) or (backwards_share(context) or 0.0) > MORE):
         return  # one fault explains both: see wheels.check_direction
     off = abs(np.angle(np.exp(1j * (angle - 0.5 * np.pi * quarter))))
     axes = {1: ("-y", "+x", "+z"), 2: ("-x", "-y", "+z"), 3: ("+y", "-x", "+z")}.get(quarter, ())

@@ -6,6 +6,7 @@ scale of the gyro about z and the lever arm of the antenna. They are found by Ga
 weights, their intervals by bootstrap over windows: errors of fixes last for many seconds.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -23,16 +24,19 @@ LEAST_WINDOWS, LEAST_CONTRIBUTING, LEAST_ROWS, MOST_HZ = 5, 2.0, 8, 5.0
 not add to."""
 SIGMAS, WINDOW_S = 30.0, (20.0, 60.0)
 """A window spans this many sigma of a position, within these limits."""
-STARTS_S = np.arange(-1.0, 5.1, 0.5)
-"""Delays from which the steps start: the best of them."""
-LONGEST_S = 6.0
+STARTS_S, FAR_STARTS_S, CLEARLY = np.arange(-1.0, 5.1, 0.5), np.arange(5.5, 20.1, 0.5), 0.6
+"""Delays from which the steps start: the best of them. One of the second counts where it leaves less than
+this share of what the first leave: fixes with the seconds of GPS are 18 s late."""
+LONGEST_S, LONGEST_FAR_S = 6.0, 21.0
 PRIOR = np.array([0.2, 3.0, 0.5, 0.5, 0.02])
-"""1 sigma of scale, delay (s) and lever arm (m) before the data: what they do not show stays near zero."""
+"""1 sigma of scale, delay (s) and lever arm (m) before the data: what they do not show stays near zero, a
+delay of many seconds near where it was found."""
 STEPS, HUBER = 6, 2.0
 SPIKES_S = 0.2
 """Speeds sampled faster than this lose spikes of one sample."""
-MOST_SCALE, MOST_NOISE = 0.3, 0.1
-"""Beyond this scale, or with this scatter over the size of a window, the paths are unlike."""
+MOST_SCALE, MOST_NOISE, MOST_CLEAR_NOISE = 0.3, 0.1, 0.25
+"""Beyond this scale, or with this scatter over the size of a window, the paths are unlike; the third where a
+delay fits clearly better than none."""
 
 
 @dataclass(frozen=True)
@@ -91,25 +95,46 @@ def _real(columns: Complex) -> Array:
 
 def path_model(context: CheckContext, measured: MeasuredPath | None) -> PathModel | None:
     """Fit it; None where wheels, gyro or windows are too few, or the paths are unlike."""
-    windows = _windows(context, measured) if measured is not None else None
+    if measured is None:
+        return None
+    wide = _windows(context, measured, LONGEST_FAR_S)
+    far_s = _far_start(wide) if wide is not None else None
+    if wide is not None and far_s is not None:
+        return _fitted(wide, far_s, far_s, MOST_CLEAR_NOISE)
+    windows = _windows(context, measured, LONGEST_S)
     if windows is None:
         return None
-    starts = [(_rest(windows, delay), delay) for delay in STARTS_S.tolist()]
-    unknown = np.array([0.0, min(starts)[1], 0.0, 0.0, 0.0])
+    rest, start_s = min((_rest(windows, s), s) for s in STARTS_S.tolist())
+    clear = rest < CLEARLY * _rest(windows, 0.0)
+    return _fitted(windows, start_s, 0.0, MOST_CLEAR_NOISE if clear else MOST_NOISE)
+
+
+def _far_start(windows: _Windows) -> float | None:
+    """A delay of many seconds that fits clearly better than a usual one, also of a mirrored path: a figure of
+    eight looks like its own mirror image half a round later."""
+    mirrored = dataclasses.replace(windows, place=windows.place.conj())
+    near = min(_rest(one, s) for one in (windows, mirrored) for s in STARTS_S.tolist())
+    rest, far_s = min((_rest(windows, s), s) for s in FAR_STARTS_S.tolist())
+    return far_s if rest < CLEARLY * near else None
+
+
+def _fitted(windows: _Windows, start_s: float, usual_s: float, most_noise: float) -> PathModel | None:
+    """The model by steps from a delay; None where they lead too far, or the paths are unlike."""
+    unknown, usual = np.array([0.0, start_s, 0.0, 0.0, 0.0]), np.array([0.0, usual_s, 0.0, 0.0, 0.0])
     for _ in range(STEPS):
         H, h, noise = _normal(windows, unknown)
         if len(H) < LEAST_WINDOWS:
             return None
         prior = np.diag(noise**2 / PRIOR**2)
-        unknown = unknown + np.linalg.solve(H.sum(axis=0) + prior, h.sum(axis=0) - prior @ unknown)
-        if abs(unknown[1]) > LONGEST_S or abs(unknown[0]) > MOST_SCALE:
+        unknown = unknown + np.linalg.solve(H.sum(axis=0) + prior, h.sum(axis=0) - prior @ (unknown - usual))
+        if abs(unknown[1] - usual_s) > LONGEST_S or abs(unknown[0]) > MOST_SCALE:
             return None
     H, h, noise = _normal(windows, unknown)
-    if len(H) < LEAST_WINDOWS or noise > MOST_NOISE * windows.size_m():
+    if len(H) < LEAST_WINDOWS or noise > most_noise * windows.size_m():
         return None
     prior = np.diag(noise**2 / PRIOR**2)
     draws = resampled_rows(len(H), RESAMPLES, SEED)
-    right = h[draws].sum(axis=1) - prior @ unknown
+    right = h[draws].sum(axis=1) - prior @ (unknown - usual)
     drawn = unknown + np.linalg.solve(H[draws].sum(axis=1) + prior, right[..., None])[..., 0]
     scale, delay = (
         interval_of(float(unknown[k]), drawn[:, k], len(H))
@@ -126,14 +151,14 @@ def _contributing(information: Array) -> float:
     return total**2 / float(np.sum(information**2)) if total > 0.0 else 0.0
 
 
-def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
+def _windows(context: CheckContext, measured: MeasuredPath, longest_s: float) -> _Windows | None:
     from scipy.ndimage import median_filter
 
     driven = driven_and_turned(context)
     if driven is None:
         return None
     t, v, turned = driven
-    inside = (measured.t_s >= t[0] + LONGEST_S) & (measured.t_s <= t[-1] - LONGEST_S)
+    inside = (measured.t_s >= t[0] + longest_s) & (measured.t_s <= t[-1] - longest_s)
     t_fix, place = measured.t_s[inside], measured.place[inside]
     if turned is None or len(t_fix) < LEAST_WINDOWS * LEAST_ROWS:
         return None

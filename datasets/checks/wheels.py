@@ -7,8 +7,16 @@ from functools import partial
 import numpy as np
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.finding import CheckContext, Finding, changed
-from terrafusion.datasets.checks.imu import gravity, heading, wheels_turn_backwards
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed
+from terrafusion.datasets.checks.imu import (
+    MORE,
+    MOSTLY,
+    backwards_share,
+    gravity,
+    heading,
+    turning_axis,
+    wheels_turn_backwards,
+)
 from terrafusion.datasets.checks.path import measured_paths
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
@@ -106,9 +114,25 @@ def check_direction(context: CheckContext) -> Iterator[Finding]:
         "wheel-reversed", "error", "wheels",
         "the wheels run backwards when the robot drives forward",
         evidence,
-        "change the sign of all wheels",
-        partial(_change_signs, sides=("left", "right")),
+        *_reversal(context),
     )  # fmt: skip
+
+
+def _reversal(context: CheckContext) -> tuple[str, Repair]:
+    """What to do with wheels that run backwards; where they turn as the gyro does, their sides are swapped,
+    too."""
+    wheels, signs = context.recording.wheels, partial(_change_signs, sides=("left", "right"))
+    if wheels is None or not wheels.has_sides() or turning_axis(context) != "+z":
+        return "change the sign of all wheels", signs
+    swap = changed("wheels", swapped)
+    return "change the sign of all wheels and swap left and right", lambda recording: swap(signs(recording))
+
+
+def swapped(wheels: Wheels) -> Wheels:
+    """With left and right exchanged."""
+    other = [0] if len(wheels.names) == 1 else [k ^ 1 for k in range(len(wheels.names))]
+    angle = None if wheels.angle_rad is None else wheels.angle_rad[:, other]
+    return dataclasses.replace(wheels, speed=wheels.speed[:, other], angle_rad=angle)
 
 
 def _change_signs(recording: Recording, sides: tuple[str, ...]) -> Recording:
@@ -182,8 +206,15 @@ def runs_backwards(context: CheckContext) -> str | None:
         return None
     found = heading(context)
     if found is not None and found.angle is not None:
-        backwards = abs(found.angle) > 0.75 * np.pi and wheels_turn_backwards(context)
-        return "acceleration answers them with the opposite sign" if backwards else None
+        if abs(found.angle) <= 0.75 * np.pi:
+            return None
+        if wheels_turn_backwards(context):
+            return "acceleration answers them with the opposite sign"
+        # Either wheels or IMU stand the wrong way round: few robots drive backwards, fewer with such an IMU.
+        share = backwards_share(context)
+        if share is None or share < MORE:
+            return None
+        return f"net {share:.0%} of the way is backwards; acceleration answers with the opposite sign"
     t, v = driven
     rolled = motion.Integral(t, motion.cumulative(t, v))
     for name, forward in _forward_distances(context).items():
@@ -197,7 +228,7 @@ def runs_backwards(context: CheckContext) -> str | None:
             r = float(np.sum(a * b)) / power
             return f"{name} goes the other way (correlation {r:.2f})" if r < -motion.SURE_R else None
     total = float(np.abs(v).sum())
-    mostly = total > 0.0 and float(v.sum()) / total < -0.8 and t[-1] - t[0] > LEAST_S
+    mostly = total > 0.0 and float(v.sum()) / total < -MOSTLY and t[-1] - t[0] > LEAST_S
     return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(context) else None
 
 

@@ -3,7 +3,6 @@
 Where two contradict each other, the smallest set of sources whose reversal makes all agree is at fault.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations, product
@@ -14,8 +13,7 @@ from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, once, scaled
 from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.imu import heading, is_upright
-from terrafusion.datasets.checks.wheels import runs_backwards, sides_opposed
-from terrafusion.datasets.core.channels import Wheels
+from terrafusion.datasets.checks.wheels import runs_backwards, sides_opposed, swapped
 from terrafusion.datasets.core.conventions import Conventions, apply
 
 Agreements = dict[tuple[str, str], motion.Agreement]
@@ -212,15 +210,9 @@ def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
     command_sign = scaled("command", -1.0, "yaw_rate_radps")
     remedies: dict[str, tuple[str, Repair | None]] = {
         "gyro": ("change the sign of gyro z (left turn positive)", gyro_sign),
-        "wheels": ("swap left and right wheels", changed("wheels", _swapped)),
+        "wheels": ("swap left and right wheels", changed("wheels", swapped)),
         "truth": ("check the truth's frame: its yaw must grow to the left", None),
         "command": ("change the sign of the commanded yaw rate (left turn positive)", command_sign),
         "accelerometer": ("check the accelerometer's axes: x, y and z must make a right-handed frame", None),
     }
     return remedies[name]
-
-
-def _swapped(wheels: Wheels) -> Wheels:
-    other = [0] if len(wheels.names) == 1 else [k ^ 1 for k in range(len(wheels.names))]
-    angle = None if wheels.angle_rad is None else wheels.angle_rad[:, other]
-    return dataclasses.replace(wheels, speed=wheels.speed[:, other], angle_rad=angle)

@@ -223,7 +223,7 @@ def summary(result: ReplayResult) -> list[str]:
     lines += _baseline_lines(result.baselines)
     for outage in scores.outages:
         if outage.end_error_m is None or outage.median_m is None:
-            lines.append(f"outage at {outage.start_s:g} s: nothing to score against")
+            lines.append(f"outage at {outage.start_s:g} s: nothing to score against near its end")
         else:
             lines.append(
                 f"outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: median error "

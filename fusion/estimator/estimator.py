@@ -418,7 +418,7 @@ class Estimator:
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
         """Zero-velocity update where the robot has stood for a window."""
-        known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
+        known = not self._is_outage(t_ns)
         sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
         biases = before.bias.gyroscope(), before.bias.accelerometer()
         if self._stationarity.is_stationary(
@@ -426,15 +426,19 @@ class Estimator:
         ):
             add_zero_velocity(self.chain, k, link)
 
+    def _is_outage(self, t_ns: int) -> bool:
+        """Whether no fix has come for long; one that comes late is as old as its delay."""
+        used_ns = self.gnss.last_used_ns
+        return used_ns is None or (t_ns - used_ns) * 1e-9 > OUTAGE_S + max(self.gnss.delay_s, 0.0)
+
     def _emitted(self, t_ns: int, gyro: Array) -> State:
         key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
-        outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             terrain=self.weights.posterior(),
-            status="no_gnss" if self.gnss.local else ("outage" if outage else "running"),
+            status="no_gnss" if self.gnss.local else ("outage" if self._is_outage(t_ns) else "running"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._covariance, gyro, gyro_sigma),

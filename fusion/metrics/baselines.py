@@ -107,7 +107,7 @@ def baselines(
         receiver = _receiver_error_m(fixes, errors, 0j if against_antenna else lever)
     found = []
     for outage in outages:
-        rows = np.flatnonzero(outage.covers(errors.t_ns, recording.start_ns))
+        rows = outage.scored(errors, int(known.trajectory.t_ns[-1]), recording.start_ns)
         ends: list[float | None] = [None, None]
         if len(rows):
             begin_ns = recording.start_ns + round(outage.start_s * 1e9)

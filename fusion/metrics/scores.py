@@ -44,6 +44,8 @@ from terrafusion.fusion.metrics.error_series import (
 
 Rows = NDArray[np.int64]
 
+LEFT_S, LEFT_SHARE = 2.0, 0.25
+"""References must reach this close to the end of an outage, s or as a share of it."""
 RPE_LENGTHS_M = (10, 50, 100)
 """Path lengths of the relative pose error."""
 
@@ -59,6 +61,19 @@ class Outage:
         """Whether times (N,) lie in start <= t < end; `start_ns` is the start of the recording."""
         t_s = (t_ns - start_ns) * 1e-9
         return np.asarray((t_s >= self.start_s) & (t_s < self.start_s + self.seconds))
+
+    def scored(self, errors: Errors, end_ns: int, start_ns: int) -> Rows:
+        """Rows (n,) of the references inside, none where they end long before it does.
+
+        Args:
+            end_ns: time of the last keyframe: an outage ends there at the latest.
+        """
+        rows = np.flatnonzero(self.covers(errors.t_ns, start_ns))
+        if not len(rows):
+            return rows
+        end_s = min(self.start_s + self.seconds, (end_ns - start_ns) * 1e-9)
+        left_s = end_s - float(errors.t_ns[rows[-1]] - start_ns) * 1e-9
+        return rows if left_s <= max(LEFT_S, LEFT_SHARE * (end_s - self.start_s)) else rows[:0]
 
 
 @dataclass(frozen=True)
@@ -227,14 +242,14 @@ def _held_out(errors: Errors | None) -> HeldOut | None:
 
 
 def _outage(outage: Outage, estimate: Estimate, errors: Errors | None, start_ns: int) -> OutageScore:
-    """Errors at the references inside the outage; the end error is that of the last of them."""
+    """Errors at the references inside the outage; the end error is that of the last of them, near its end."""
     path = estimate.trajectory
     inside = outage.covers(path.t_ns, start_ns)
     moved = travelled_m(path.position_m[inside])
     distance = float(moved[-1]) if len(moved) else 0.0
     if errors is None or not np.isfinite(errors.reference_m).any():
         return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
-    rows = outage.covers(errors.t_ns, start_ns)
+    rows = outage.scored(errors, int(path.t_ns[-1]), start_ns)
     error = errors.distance_m()[rows]
     if not len(error):
         return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)

@@ -251,7 +251,7 @@ def _outage_name(outage: Mapping[str, Any]) -> str:
 def _outage_sentence(outage: Mapping[str, Any]) -> str:
     name = _outage_name(outage)
     if outage["end_error_m"] is None:
-        return f"{name} there was nothing to score against."
+        return f"{name} there was nothing to score against near its end."
     share = "" if outage["percent"] is None else f", {number(outage['percent'], 2)} % of the distance"
     return (
         f"{name} the position was {number(outage['end_error_m'], 2)} m off at the end, "

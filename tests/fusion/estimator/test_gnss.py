@@ -463,6 +463,16 @@ def test_a_doubt_that_comes_with_no_fix_is_in_the_state(monkeypatch) -> None:
     assert estimator.latest().covariance[0, 0] > 4.0
 
 
+def test_fixes_that_come_late_are_no_outage_before_they_are_overdue() -> None:
+    estimator = started(0.0)
+    now_ns = estimator.latest().t_ns
+    estimator.gnss.last_used_ns = now_ns
+    for delay_s, outage_from_s in ((0.0, 2.0), (2.5, 4.5)):
+        estimator.gnss.delay_s = delay_s
+        assert not estimator._is_outage(now_ns + round((outage_from_s - 0.1) * 1e9))
+        assert estimator._is_outage(now_ns + round((outage_from_s + 0.1) * 1e9))
+
+
 def started(heading_rad: float) -> Estimator:
     """At rest for a second, at a known place."""
     made = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate"))

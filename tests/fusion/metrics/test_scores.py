@@ -248,6 +248,17 @@ def test_an_outage_without_reference_is_not_scored(drive):
     assert inside.distance_m == pytest.approx(19.9, abs=0.2)
 
 
+def test_an_outage_whose_references_end_at_its_start_is_not_scored(drive):
+    d = drive()
+    truth = d.recording.truth
+    until = truth.select((truth.t_ns - d.recording.start_ns) * 1e-9 < 41.0)
+    log = dataclasses.replace(d.recording, truth=until)
+    early, whole = score(d.estimate, log, outages=[Outage(40.0, 30.0), Outage(20.0, 21.0)]).outages
+    assert (early.end_error_m, early.median_m, early.percent) == (None, None, None)
+    assert early.distance_m > 0.0
+    assert whole.end_error_m is not None
+
+
 def test_held_out_fixes_are_compared_at_the_antenna(drive):
     d = drive(turn_radps=0.0)
     ahead = dataclasses.replace(d.fixes, enu_m=d.fixes.enu_m + np.array([0.4, 0.0, 0.0]))
