@@ -84,6 +84,14 @@ def _mounting(context: CheckContext) -> Array:
     return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
 
 
+def _rotated(R: Array, vectors: Array) -> Array:
+    """R @ v of vectors (N, 3); a NaN axis affects only the axes that R turns it into."""
+    unknown = np.isnan(vectors)
+    turned = np.where(unknown, 0.0, vectors) @ R.T
+    turned[unknown @ (R != 0.0).T] = np.nan
+    return np.asarray(turned)
+
+
 def is_metric(mean: Array) -> bool:
     """Whether a mean specific force is as long as gravity in m/s2."""
     return bool(0.85 * GRAVITY_MPS2 < np.linalg.norm(mean) < 1.15 * GRAVITY_MPS2)
@@ -267,7 +275,7 @@ def heading(context: CheckContext) -> ForceHeading | None:
     if imu is None or not is_upright(context):
         return None
     R = _mounting(context)
-    return heading_of(context, (imu.accel_mps2 @ R.T)[:, :2], (imu.gyro_radps @ R.T)[:, 2])
+    return heading_of(context, _rotated(R, imu.accel_mps2)[:, :2], _rotated(R, imu.gyro_radps)[:, 2])
 
 
 def turning_axis(context: CheckContext) -> str | None:

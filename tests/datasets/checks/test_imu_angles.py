@@ -25,3 +25,15 @@ def test_an_imu_mounted_as_the_vehicle_file_says_is_no_finding(
     names = ("imu_roll_rad", "imu_pitch_rad", "imu_yaw_rad")
     known = {name: KnownNumber(a, "measured") for name, a in zip(names, angles_rad, strict=True)}
     assert run_checks(log, dataclasses.replace(rig, known=SensorNumbers(**known))) == []
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, -0.4])
+def test_a_gyro_of_one_axis_is_enough_to_see_where_the_imu_points(yaw_rad: float, husky_rig: Rig) -> None:
+    """Only z of the gyro is measured, and the vehicle file has its angle about z."""
+    turn = Rotation.from_euler("z", 0.5 * np.pi + yaw_rad).as_matrix()
+    log = imu_with(
+        gyro_radps=lambda g: np.where([True, True, False], np.nan, g), accel_mps2=lambda a: a @ turn
+    )(lively_drive())
+    known = SensorNumbers(imu_yaw_rad=KnownNumber(yaw_rad, "measured"))
+    rig = dataclasses.replace(husky_rig, wheel_radius_m=RADIUS_M, sensors=level(husky_rig), known=known)
+    assert [finding.code for finding in run_checks(log, rig) if finding.channel == "imu"] == ["imu-forward"]
