@@ -70,8 +70,7 @@ def segment(recording: Recording, begin_s: float, end_s: float) -> Recording:
     terrain = recording.terrain
     if terrain is not None and len(terrain):
         first = max(0, int(np.searchsorted(terrain.t_ns, start, side="right")) - 1)
-        last = max(first + 1, int(np.searchsorted(terrain.t_ns, end)))
-        labels = terrain.select(slice(first, last))
+        labels = terrain.select(slice(first, int(np.searchsorted(terrain.t_ns, end))))
         parts["terrain"] = dataclasses.replace(labels, t_ns=np.maximum(labels.t_ns, start))
     present: dict[str, Any] = {name: channel if len(channel) else None for name, channel in parts.items()}
     if not any(channel is not None for name, channel in present.items() if name != "terrain"):

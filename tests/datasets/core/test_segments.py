@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -57,3 +59,11 @@ def test_bad_segments_are_refused(text: str) -> None:
 def test_a_segment_beyond_the_log_is_refused(drive: Recording) -> None:
     with pytest.raises(DataError, match="drive: nothing was recorded from 100 to 120 s; the log lasts 60 s"):
         segment(drive, 100.0, 120.0)
+
+
+def test_a_segment_before_the_first_ground_label_has_none(drive: Recording) -> None:
+    assert drive.terrain is not None
+    late = dataclasses.replace(drive.terrain.select(slice(1)), t_ns=drive.terrain.t_ns[:1] + 50_000_000_000)
+    recording = dataclasses.replace(drive, terrain=late)
+    assert segment(recording, 0.0, 45.0).terrain is None
+    assert segment(recording, 45.0, 55.0).terrain is not None
