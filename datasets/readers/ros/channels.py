@@ -31,13 +31,11 @@ from terrafusion.datasets.readers.ros.joints import (
     wheel_joints,
 )
 from terrafusion.datasets.readers.ros.messages import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
-from terrafusion.datasets.readers.text.fixes import Fixes, located
+from terrafusion.datasets.readers.text.fixes import Fixes, located, with_assumed_sigma
 
 Datum = tuple[float, float, float]
 
 NOMINAL_TRACK_M = 1.0
-DEFAULT_SIGMA_M = (3.0, 6.0)
-"""Horizontal and vertical sigma of a stand-alone fix without a covariance."""
 NAVSATFIX = ("latitude", "longitude", "altitude")
 FIX_OF_STATUS = {1: Fix.DGPS, 2: Fix.FIXED}
 MOVING_MPS = 0.05
@@ -240,29 +238,22 @@ class ChannelBuilder:
         self.notes += notes
         if not held.any():
             return None, datum
-        return Gnss(t_ns[held], enu, self._sigma(stream.select(held)), fix[held]), datum
+        sigma, notes = with_assumed_sigma(self.rig, self._sigma(stream.select(held)), fix[held])
+        self.notes += notes
+        return Gnss(t_ns[held], enu, sigma, fix[held]), datum
 
     def _llh(self, stream: Stream) -> Array:
         """Latitude, longitude (deg) and height (m), (N, 3)."""
         return np.stack([stream.column(name).astype(float) for name in NAVSATFIX], axis=1)
 
     def _sigma(self, stream: Stream) -> Array:
+        """Sigmas (N, 3) m, NaN where the receiver gives no covariance."""
         variance = np.stack(
             [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)], axis=1
         )
-        unknown = stream.column("position_covariance_type") == 0
+        variance[stream.column("position_covariance_type") == 0] = np.nan
         with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(variance)
-        if unknown.any():
-            spec = self.rig.sensors.gnss if self.rig else None
-            flat, up = (spec.sigma_horizontal_m, spec.sigma_vertical_m) if spec else DEFAULT_SIGMA_M
-            sigma[unknown] = (flat, flat, up)
-            origin = "the vehicle's receiver" if spec else "a stand-alone receiver, assumed"
-            self.notes.append(
-                f"gnss: {int(unknown.sum())} fixes have no covariance; sigma {flat:g} m flat and {up:g} m up "
-                f"({origin})"
-            )
-        return sigma
+            return np.asarray(np.sqrt(variance))
 
     def gnss_velocity(self, gnss: Gnss, stream: Stream, t_ns: TimesNs) -> Gnss:
         """The fixes with the ENU velocity of another topic, matched within half a fix interval."""

@@ -11,7 +11,7 @@ from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, Rig
 from terrafusion.datasets.readers.formats import Request
 
 Datum = tuple[float, float, float]
@@ -62,7 +62,7 @@ def gnss_channel(
     if not held.any():
         return None, datum, [*notes, "gnss: no row holds a fix; the channel is absent"]
     fixes = fixes.select(held)
-    sigma, note = with_assumed_sigma(request, fixes.sigma_enu_m, fixes.fix)
+    sigma, note = with_assumed_sigma(request.rig, fixes.sigma_enu_m, fixes.fix)
     velocity, sigma_v = fixes.velocity_enu_mps, fixes.sigma_v_mps
     if velocity is None or not np.isfinite(velocity[:, :2]).any():
         velocity = sigma_v = None
@@ -109,14 +109,14 @@ def located(
     return held, enu, datum, notes
 
 
-def with_assumed_sigma(request: Request, sigma: Array, fix: NDArray[np.uint8]) -> tuple[Array, list[str]]:
+def with_assumed_sigma(rig: Rig | None, sigma: Array, fix: NDArray[np.uint8]) -> tuple[Array, list[str]]:
     """Sigmas (N, 3) with the unknown and the non-positive ones filled, and a note where any was."""
     unknown = ~(sigma > 0.0)
     if not unknown[:, :2].any():
         sigma = np.where(unknown, np.nan, sigma)
         return sigma, []
     filled = int(unknown[:, :2].any(axis=1).sum())
-    spec = request.rig.sensors.gnss if request.rig else None
+    spec = rig.sensors.gnss if rig else None
     if spec is not None:
         assumed = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
         origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"

@@ -232,7 +232,7 @@ class _Reader(ChannelReader):
             channel, self.datum, notes = gnss_channel(self.request, fixes, self.datum)
             self.notes += notes
             return channel
-        sigma, notes = with_assumed_sigma(self.request, sigma, fix)
+        sigma, notes = with_assumed_sigma(self.request.rig, sigma, fix)
         self.notes += notes
         channel = Gnss(
             self._t(table), table.stack(("east_m", "north_m", "up_m")), sigma, fix, velocity, sigma_v

@@ -239,6 +239,22 @@ def test_fixes(tmp_path: Path, husky_rig: Rig) -> None:
     assert "2 of 5 messages of /fix hold no fix" in notes_of(recording)
 
 
+@pytest.mark.parametrize(
+    ("status", "sigma_m"), [(0, (3.0, 3.0, 6.0)), (1, (1.0, 1.0, 2.0)), (2, (0.02, 0.02, 0.04))]
+)
+def test_fixes_without_a_covariance_have_the_sigma_of_their_class(
+    tmp_path: Path, status: int, sigma_m: tuple[float, ...]
+) -> None:
+    """As in tables (`with_assumed_sigma`)."""
+    message = MAKE1.fix(T0, 48.0, 11.0, 500.0, status=status, kind=0)
+    recording = open_recording(
+        write_ros1(tmp_path / "a.bag", [("/fix", "sensor_msgs/msg/NavSatFix", T0, message)])
+    )
+    assert recording.gnss is not None
+    assert recording.gnss.sigma_enu_m.tolist() == [list(sigma_m)]
+    assert "1 fixes have no sigma; taken from assumed by class" in notes_of(recording)
+
+
 def stamped(stamps: list[int], topic: str = "/imu") -> list[Message]:
     return [(topic, "sensor_msgs/msg/Imu", T0 + i * 10**7, MAKE1.imu(t)) for i, t in enumerate(stamps)]
 
