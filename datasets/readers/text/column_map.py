@@ -126,15 +126,24 @@ def contract_map(names: list[str]) -> ColumnMap | None:
     rest = [name for name in names if name != "t_s"]
     channels: dict[str, dict[str, MappedColumn]] = {}
     for name in rest:
-        owners = [c for c in FIELDS if name in FIELDS[c] or (c == "terrain" and name.startswith("p_"))]
-        if len(owners) > 1:  # v_mps: of the truth's twist beside x_m, else commanded
-            owners = ["truth" if "x_m" in names else "command"]
-        if not owners:
+        owner = _owner(name, names)
+        if owner is None:
             return None
-        channels.setdefault(owners[0], {})[name] = MappedColumn(name)
+        channels.setdefault(owner, {})[name] = MappedColumn(name)
     if "t_s" not in names or not channels:
         return None
     return ColumnMap(time=TimeColumn("t_s", "s", "none"), channels=channels)
+
+
+def _owner(name: str, names: list[str]) -> str | None:
+    """The channel of a column of the log folder, by the columns beside it; None for another name."""
+    owners = [channel for channel, fields in FIELDS.items() if name in fields]
+    if owners == ["command", "truth"]:  # v_mps: of the truth's twist beside x_m, else commanded
+        return "truth" if "x_m" in names else "command"
+    if owners == ["wheels", "steering"]:  # front_left_rad: of the wheel beside its speed, else steered
+        wheel = name.removesuffix("_rad")
+        return "wheels" if {f"{wheel}_radps", f"{wheel}_mps"} & set(names) else "steering"
+    return owners[0] if owners else "terrain" if name.startswith("p_") else None
 
 
 def starter_map(names: list[str]) -> str:
