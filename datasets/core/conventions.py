@@ -12,13 +12,17 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
-from terrafusion.datasets.core.quantity import Position, Sourced, Word
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.quantity import Position, Sourced, Word, shown
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import DRIVES, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
 Sign = Annotated[float, Sourced("", -1.0, 1.0)]
 BODY_AXES = ("+x", "+y", "+z")
+LATE_CHANNELS = (*Recording.CHANNELS, "truth")
+HELD_CHANNELS = tuple(name for name in LATE_CHANNELS if name != "terrain")
+"""Channels that `lag_s` and `held` can name: a ground label holds until the next by definition."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,9 @@ class Conventions:
         wheel_radius_m, track_m: of the robot; the track is the geometric one.
         drive, wheelbase_m: how the robot turns, and the distance of its axles.
         antenna_m, imu_m: positions in the body frame.
-        held: rows for which a channel holds a value, by channel name ("wheels", "imu", "gnss",
-            "truth"); of a run of equal rows the first and then every so many rows are true updates.
-        lag_s: seconds by which a channel's times are late, by channel name.
+        held: rows for which a channel holds a value, by channel name (`HELD_CHANNELS`); of a run of
+            equal rows the first and then every so many rows are true updates.
+        lag_s: seconds by which a channel's times are late, by channel name (`LATE_CHANNELS`).
         truth_channels: channels of the truth that can be scored against; () for all.
         terrain: name of the ground of the whole log, "" where unknown.
     """
@@ -58,6 +62,10 @@ class Conventions:
 
     def __post_init__(self) -> None:
         axes_matrix(self.imu_axes)
+        for key, named, known in (("held", self.held, HELD_CHANNELS), ("lag_s", self.lag_s, LATE_CHANNELS)):
+            wrong = next((name for name in named if name not in known), None)
+            if wrong is not None:
+                raise ValueError(f"'{key}' names the channel '{shown(wrong)}'; give {', '.join(known)}")
 
 
 def apply(recording: Recording, conventions: Conventions) -> Recording:
@@ -111,6 +119,13 @@ def _wheels(recording: Recording, c: Conventions) -> Recording:
     wheels = recording.wheels
     if wheels is None or c.left_wheels_sign == c.right_wheels_sign == 1.0:
         return recording
+    if not wheels.has_sides() and c.left_wheels_sign != c.right_wheels_sign:
+        raise DataError(
+            "has one speed for both sides, but the left and right wheels are to get different signs",
+            file=recording.name,
+            channel="wheels",
+            remedy="give left_wheels_sign and right_wheels_sign alike, or leave both out",
+        )
     signs = np.array(
         [c.left_wheels_sign if n.endswith("left") else c.right_wheels_sign for n in wheels.names]
     )
@@ -127,8 +142,9 @@ def _true_updates(recording: Recording, c: Conventions) -> Recording:
         channel = getattr(recording, name)
         if channel is None or not len(channel):
             continue
-        keep = true_updates(_values(channel), round(rows))
-        if keep.all():
+        values = _values(channel)
+        keep = true_updates(values, round(rows))
+        if keep.all() or not values.shape[1]:
             continue
         note = f"{name}: held values dropped: {int(keep.sum())} true updates of {len(keep)} rows"
         recording = dataclasses.replace(recording, **{name: channel.select(keep)}).with_notes(note)
@@ -152,7 +168,7 @@ def _values(channel: Channel | Trajectory) -> Array:
             else np.hstack([channel.position_m, channel.quaternion])
         )
     columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
-    return np.stack(columns, axis=1)
+    return np.stack(columns, axis=1) if columns else np.zeros((len(channel), 0))
 
 
 def _lags(recording: Recording, c: Conventions) -> Recording:

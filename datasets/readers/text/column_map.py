@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from terrafusion.datasets.core.config import Prepared, refuse, structure
-from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.core.conventions import BODY_AXES, HELD_CHANNELS, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.quantity import Quantity, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
@@ -202,9 +202,9 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
     except ValueError as error:
         what, _, remedy = str(error).partition("; ")
         yield f"'imu_axes': {what}", remedy
-    strange = [channel for channel in found.held if channel not in FIELDS]
+    strange = [channel for channel in found.held if channel not in HELD_CHANNELS]
     if strange:
-        yield f"'held' names the unknown channel '{shown(strange[0])}'", f"known are {', '.join(FIELDS)}"
+        yield f"'held' names the channel '{shown(strange[0])}'", f"give {', '.join(HELD_CHANNELS)}"
     if not any(found.channels.values()):
         yield "'channels' is empty", f"give {', '.join(FIELDS)}"
     for channel, fields in found.channels.items():

@@ -136,3 +136,15 @@ def test_a_misspelt_key_of_a_set_is_told(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv(catalog.CATALOG_VARIABLE, str(tmp_path))
     with pytest.raises(ConfigError, match=r"unknown key 'mine\.titel'; did you mean 'title'"):
         catalog.load_catalog()
+
+
+def test_a_convention_of_an_unknown_channel_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = "title: x, holds: x, licence: x, citation: x, homepage: x, format: ''"
+    held = "conventions: {held: {weels: {value: 5, source: a test}}}"
+    (tmp_path / "catalog.yaml").write_text(f"mine: {{{texts}, {held}}}\n")
+    (tmp_path / "catalog_files.csv").write_text(",".join(catalog.FILE_COLUMNS) + "\n")
+    monkeypatch.setenv(catalog.CATALOG_VARIABLE, str(tmp_path))
+    with pytest.raises(
+        ConfigError, match=r"mine\.conventions: 'held' names the channel 'weels'; give command"
+    ):
+        catalog.load_catalog()

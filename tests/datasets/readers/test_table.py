@@ -319,6 +319,10 @@ WRONG_MAPS = {
     "axes that are none": (GYRO_MAP + "imu_axes: ['+x', '+y', '-z']\n", "not a rotation"),
     "impossible radius": (GYRO_MAP + "wheel_radius_m: 165\n", "wheel_radius_m.*out of range"),
     "held of nothing": (GYRO_MAP + "held: {gyro: 3}\n", "'held'"),
+    "held ground labels": (
+        GYRO_MAP + "held: {terrain: 5}\n",
+        "'held' names the channel 'terrain'; give comm",
+    ),
     "both positions": (
         "time: {column: t}\nchannels: {gnss: {latitude_deg: t, longitude_deg: t, east_m: t, north_m: t}}",
         "either latitude",
