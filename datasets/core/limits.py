@@ -34,8 +34,8 @@ SQL_STEPS, SQL_STEPS_PER_BYTE = 10_000_000, 10
 HDF5_VALUES, HDF5_REFERENCES = 2_000_000, 10_000
 """Values of a variable, and of a stored piece of one: two hours at 250 Hz."""
 MATLAB_BYTES, MATLAB_STRUCTURES, MATLAB_FIELDS, MATLAB_VARIABLES = 64 * 2**20, 10_000, 64, 1_000
-PICKLE_BYTES, PICKLE_CELLS = 32 * 2**20, 20_000_000
-"""Two hours of a published log have 32 MiB and 370 000 cells."""
+PICKLE_BYTES = 32 * 2**20
+"""Two hours of a published log have as many."""
 
 
 def too_much(what: str, most: float, remedy: str = "split it") -> DataError:

@@ -28,7 +28,7 @@ class Request:
         stamps: "header" or "receipt", for bags.
         repair_clock: remove steps of a clock (and list them in `clock_jumps`) instead of refusing them.
         columns: YAML that says what the columns of a plain table are.
-        trusted: the file's bytes are those of a catalogue entry.
+        sha256: of the catalogue entry whose bytes are the file's, "" where there is none.
         conventions: of the catalogue; applied after reading, here for readers that need some of them.
     """
 
@@ -38,7 +38,7 @@ class Request:
     stamps: str = "header"
     repair_clock: bool = False
     columns: Path | None = None
-    trusted: bool = False
+    sha256: str = ""
     conventions: Conventions = field(default_factory=Conventions)
 
 

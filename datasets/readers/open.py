@@ -55,7 +55,8 @@ def open_recordings(
     if rig is not None and form.name in ("ros1", "ros2"):
         conventions = dataclasses.replace(conventions, imu_axes=BODY_AXES)  # the reader turns it by the rig
     map_file = Path(columns) if columns is not None else None
-    request = Request(place, rig, topics, stamps, repair_clock, map_file, entry is not None, conventions)
+    pinned = entry.sha256 if entry is not None else ""
+    request = Request(place, rig, topics, stamps, repair_clock, map_file, pinned, conventions)
     recordings = form.read(request)
     if number is not None and number >= len(recordings):
         what = f"holds {len(recordings)} recordings, numbered from 0"

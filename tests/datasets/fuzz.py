@@ -137,7 +137,7 @@ def mutated(rng: np.random.Generator, sample: Path, folder: Path) -> Path:
 
 
 def open_and_examine(path: Path, repair_clock: bool) -> None:
-    """What `inspect` and `convert --apply-fixes` do with a log; a pickle's hash counts as known."""
+    """What `inspect` and `convert --apply-fixes` do with a log."""
     from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.core.conventions import Conventions, apply
     from terrafusion.datasets.readers.formats import Request, format_of
@@ -147,7 +147,7 @@ def open_and_examine(path: Path, repair_clock: bool) -> None:
     if form.name == "single_wheel_mat":  # trials, not a drive
         read_wheel_trials(path).summary()
         return
-    request = Request(path, repair_clock=repair_clock, trusted=True)
+    request = Request(path, repair_clock=repair_clock)
     for recording in list(form.read(request))[:20]:
         recording = apply(recording, Conventions())
         run_checks(recording)

@@ -2,17 +2,19 @@
 
 A drive (`raw_dataframe.pkl`) has one row every 50 ms with what was last received on each topic; a
 window file (`slip_dataset_all.pkl`) has one row a window, 40 columns a signal. A pickle is opened
-where its SHA-256 is in a catalogue, and even then by `safe_pickle` only.
+where its SHA-256 is in a catalogue, and then by `safe_pickle`.
 """
 
 import dataclasses
+import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, sha256_of
+from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Command, Imu, Motor, Terrain, Wheels
@@ -60,14 +62,7 @@ def read(request: Request) -> list[Recording]:
             columns are not those of a drive or of windows.
     """
     path = request.path
-    if not request.trusted:
-        size = path.stat().st_size
-        which = f"SHA-256 {sha256_of(path)}" if size <= limits.PICKLE_BYTES else f"{size >> 20} MiB"
-        raise DataError(
-            f"a pickle can run code, and this one ({which}) is in no catalogue",
-            remedy=f"if you trust its source, add it to a catalogue of your own ({CATALOG_VARIABLE})",
-        )
-    table = read_table(path)
+    table = read_table(_pinned_bytes(path, request.sha256))
     try:
         with errors_of(path):
             if "ros_time" in table:
@@ -82,6 +77,26 @@ def read(request: Request) -> list[Recording]:
         "has neither the columns of a drive (ros_time) nor those of windows (imu_yaw_0)",
         remedy="give a raw_dataframe.pkl or a slip_dataset_all.pkl of the DRIVE data",
     )
+
+
+def _pinned_bytes(path: Path, sha256: str) -> bytes:
+    """The bytes of the file, read once: those that are hashed are those that are unpickled."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(limits.PICKLE_BYTES + 1)
+            size = file.seek(0, os.SEEK_END)
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror or error}") from None
+    if len(data) > limits.PICKLE_BYTES:
+        most = f"give a table of up to {limits.PICKLE_BYTES >> 20} MiB"
+        raise DataError(f"the pickle has {size >> 20} MiB", remedy=most)
+    found = hashlib.sha256(data).hexdigest()
+    if found != sha256:
+        raise DataError(
+            f"a pickle can run code, and this one (SHA-256 {found}) is in no catalogue",
+            remedy=f"if you trust its source, add it to a catalogue of your own ({CATALOG_VARIABLE})",
+        )
+    return data
 
 
 def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:

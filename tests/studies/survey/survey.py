@@ -19,7 +19,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.catalog.catalog import DATA_VARIABLE, CatalogFile, data_folders, load_catalog
+from terrafusion.datasets.catalog.catalog import (
+    DATA_VARIABLE,
+    CatalogFile,
+    data_folders,
+    load_catalog,
+    sha256_of,
+)
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.checks.measures import Measures, measure
@@ -52,7 +58,7 @@ class Drives:
     @cached_property
     def logged(self) -> list[Recording]:
         """As the file has them: no convention of the catalogue applied."""
-        return list(format_of(self.path).read(Request(self.path, trusted=True)))
+        return list(format_of(self.path).read(Request(self.path, sha256=sha256_of(self.path))))
 
     @cached_property
     def opened(self) -> list[Recording]:
