@@ -30,10 +30,9 @@ MESSAGE_BYTES, TOPICS = 2**26, 10_000
 SQL_STEPS, SQL_STEPS_PER_BYTE = 10_000_000, 10
 """Instructions of SQLite for a query, and more by the size of the file: a row of 30 bytes takes about 30."""
 
-# MATLAB files and pickles
+# HDF5 files and pickles
 HDF5_VALUES, HDF5_REFERENCES = 2_000_000, 10_000
 """Values of a variable, and of a stored piece of one: two hours at 250 Hz."""
-MATLAB_BYTES, MATLAB_STRUCTURES, MATLAB_FIELDS, MATLAB_VARIABLES = 64 * 2**20, 10_000, 64, 1_000
 PICKLE_BYTES = 32 * 2**20
 """Two hours of a published log have as many."""
 

@@ -88,7 +88,6 @@ FORMATS: tuple[Format, ...] = (
     Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.sets.umich_text"),
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.sets.norlab_pickle"),
     Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.sets.pathfinder_mat"),
-    Format("single_wheel_mat", "trials of a single wheel (MATLAB v5)", f"{_READERS}.sets.single_wheel"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.sets.borealtc_csv"),
     Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.text.xsens_text"),
     Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.text.rtklib_pos"),

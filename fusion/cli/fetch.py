@@ -79,12 +79,12 @@ def _catalog_lines(rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         count = len(row["recordings"])
         about = (
-            f"{row['name']}  {count} recording{'s' if count > 1 else ''}, {row['bytes'] / 1e6:.1f} MB, "
+            f"{row['name']}  {count} recording{'s' if count != 1 else ''}, {row['bytes'] / 1e6:.1f} MB, "
             f"{row['licence']}, {row['files_here']} of {row['files']} files here"
         )
         names = ", ".join(row["recordings"][:4]) + (f", ... ({count})" if count > 4 else "")
         texts = [*(row[key] for key in ("title", "holds", "citation", "homepage")), names]
-        lines += [("bold", about), *(("", f"    {text}") for text in texts)]
+        lines += [("bold", about), *(("", f"    {text}") for text in texts if text)]
     return styled_lines(lines)
 
 

@@ -1,8 +1,5 @@
-"""`terrafusion inspect LOG`: contents of a log and findings of the log checks, or single-wheel trials, on one
-page.
-"""
+"""`terrafusion inspect LOG`: contents of a log and findings of the log checks on one page."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,6 @@ from terrafusion.fusion.cli.common import (
     rig_of,
     warn_unused,
 )
-from terrafusion.fusion.cli.inspect_page import Line
 
 
 def inspect(
@@ -52,16 +48,12 @@ def inspect(
     """
     from terrafusion.fusion.cli.inspect_page import contents_lines, page_lines, styled_lines
 
-    load_rig(vehicle)
-    HowRead(topic, stamps, columns, True).options(None)  # reports wrong usage for any kind of log
-    trials = trials_of(log) if columns is None else None
-    page = trials or inspected(log, vehicle, topic, stamps, columns)
-    lines = list(trials_lines(page) if trials else page_lines(page))
+    page = inspected(log, vehicle, topic, stamps, columns)
+    lines = list(page_lines(page))
     if report is not None:
         from terrafusion.fusion.reports.inspect import write_inspection
 
-        contents = lines if trials else contents_lines(page)
-        write_inspection(report, page, [text for _, text in contents], command_line())
+        write_inspection(report, page, [text for _, text in contents_lines(page)], command_line())
     done = "" if report is None else f"report: {report}"
     failed = any(finding["severity"] == "error" for finding in page.get("findings", ()))
     return Result(styled_lines(lines), done, page, int(failed), short=_found(page))
@@ -97,52 +89,3 @@ def inspected(
     names = {recording.name.rpartition("#")[0] for recording in recordings}
     name = names.pop() if len(names) == 1 else ""
     return summarise_all(name or Path(log).name, recordings, measures, findings)
-
-
-def trials_of(log: str) -> dict[str, Any] | None:
-    """Summary of the trials at `log` as plain data; None where the log has another format.
-
-    Raises:
-        TerrafusionError: the log cannot be read.
-    """
-    from terrafusion.datasets.catalog.catalog import load_catalog
-    from terrafusion.datasets.core.errors import DataError
-    from terrafusion.datasets.readers.formats import format_of
-    from terrafusion.datasets.readers.open import find_log
-    from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials
-
-    path, number = find_log(log)
-    if format_of(path).name != "single_wheel_mat":
-        return None
-    if number is not None:
-        raise DataError("trials have no numbers", file=path, remedy=f"leave #{number} out")
-    trials = read_wheel_trials(path)
-    entry = load_catalog().find(path)
-    return {
-        "name": path.stem,
-        "kind": "single-wheel trials",
-        "licence": load_catalog().sets[entry.set_name].licence if entry else None,
-        **trials.summary(),
-        "notes": list(trials.notes),
-    }
-
-
-def trials_lines(page: dict[str, Any]) -> Iterator[Line]:
-    """The page as lines of text; angles in degrees."""
-    import numpy as np
-
-    licence = f"; licence {page['licence']}" if page["licence"] else ""
-    yield "bold", f"{page['name']}  {page['trials']} trials of a single wheel{licence}"
-    yield "", f"          {page['driven']} driven, {page['braked']} braked"
-    yield "", ""
-    angles = ", ".join(f"{angle:.0f}" for angle in np.degrees(page["commanded_side_slip_rad"]))
-    yield "", f"side-slip commanded at {angles} deg"
-    for name, span in page.items():
-        if isinstance(span, tuple) and not name.startswith("commanded"):
-            low, high = np.degrees(span) if name.endswith("_rad") else span
-            unit = name.replace("_rad", "_deg")
-            yield "", f"{unit:20} {low:8.3g} to {high:.3g}"
-    for note in page["notes"]:
-        yield "dim", f"note      {note}"
-    yield "", ""
-    yield "", "read them with terrafusion.datasets.readers.sets.single_wheel.read_wheel_trials"

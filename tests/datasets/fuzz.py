@@ -141,14 +141,9 @@ def open_and_examine(path: Path, repair_clock: bool) -> None:
     from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.core.conventions import Conventions, apply
     from terrafusion.datasets.readers.formats import Request, format_of
-    from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials
 
-    form = format_of(path)
-    if form.name == "single_wheel_mat":  # trials, not a drive
-        read_wheel_trials(path).summary()
-        return
     request = Request(path, repair_clock=repair_clock)
-    for recording in list(form.read(request))[:20]:
+    for recording in list(format_of(path).read(request))[:20]:
         recording = apply(recording, Conventions())
         run_checks(recording)
         repair(recording)

@@ -114,7 +114,6 @@ def _bags(folder: Path) -> None:
 
 def _matlab(folder: Path) -> None:
     import h5py
-    import scipy.io
 
     t, v, rate, place = _drive(10)
     t_imu, gyro, accel = _inertial(100)
@@ -141,24 +140,6 @@ def _matlab(folder: Path) -> None:
             file[name] = np.asarray(values)[None, :]
         file["llhGPS"] = llh
         file["ENUGPS"] = np.stack([place[:, 0], place[:, 1], 0 * t], axis=1)
-    names = (
-        "avg_Fx",
-        "std_Fx",
-        "avg_Fy",
-        "std_Fy",
-        "avg_Fz",
-        "std_Fz",
-        "avg_Vx",
-        "std_Vx",
-        "avg_Vry",
-        "std_Vry",
-    )
-    names = (*names, "avg_angle", "std_angle", "avg_Z", "std_Z", "Vry", "beta", "trial_num", "slip")
-    trials = np.zeros((5, 1), dtype=[(name, "O") for name in names])
-    for k in range(5):
-        for name in names:
-            trials[name][k, 0] = np.array([[0.1 * k]])
-    scipy.io.savemat(_sample(folder, "matlab5", "trials.mat") / "trials.mat", {"all_results": trials})
 
 
 def _text(path: Path, table: np.ndarray, mark: str = " ", header: str = "") -> None:

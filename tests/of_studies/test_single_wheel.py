@@ -12,10 +12,10 @@ import pytest
 import scipy.io
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.sets.single_wheel import FIELDS, WheelTrials, read_wheel_trials
 from tests.studies.twin_field import single_wheel, single_wheel_fit
 from tests.studies.twin_field import single_wheel_scores as judge
 from tests.studies.twin_field.single_wheel_fit import FREE, fit, measured, predict
+from tests.studies.twin_field.wheel_trials import FIELDS, WheelTrials, read_wheel_trials
 
 TRUE = np.array([1.2e7, 2.0, 4.0, 0.6, 0.015, 6.0])
 

@@ -108,7 +108,7 @@ SIMULATIONS = {
     "spin_snow": "spin --terrain snow --vehicle generic --seed 7 --out {out}/log",
 }
 OTHER_LOGS = (
-    "husky_parkinglot/test2", "cmu_single_wheel/all_smooth_data", "borealtc/ASPHALT/00", "borealtc/ICE/05",
+    "husky_parkinglot/test2", "borealtc/ASPHALT/00", "borealtc/ICE/05",
     "borealtc/FLOORING/00", "borealtc/SANDY_LOAM/06", "borealtc/SNOW/08", "umich_husky/mair_mocap/trial7",
     "umich_husky/mair_mocap/trial2", "umich_husky/mair_mocap/trial3", "umich_husky/field/slip_detect1",
     "umich_husky/field/slip_detect2", "umich_husky/field/up_to_hill1", "umich_husky/field/sand_small_pebble",

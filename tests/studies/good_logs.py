@@ -58,7 +58,7 @@ def field_names() -> Iterator[str]:
     """Names of the drives of the catalogue that are on this machine."""
     for name in load_catalog().recordings():
         with contextlib.suppress(DataError):
-            if not name.startswith("cmu_single_wheel") and locate(name) is not None:
+            if locate(name) is not None:
                 yield name
 
 

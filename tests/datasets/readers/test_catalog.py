@@ -99,6 +99,8 @@ def test_a_recording_that_is_not_here_tells_how_to_get_it(
 def test_a_document_of_a_set_is_told_from_a_recording(data_folder: Path) -> None:
     with pytest.raises(DataError, match="a document of the set norlab_drive"):
         open_recording(data_folder / "norlab_drive" / "LICENSE")
+    with pytest.raises(DataError, match="a document of the set cmu_single_wheel"):
+        open_recording("cmu_single_wheel/all_smooth_data.mat")
 
 
 def test_a_misspelt_name_is_told_the_near_ones() -> None:

@@ -37,8 +37,8 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.readers.formats import Request, format_of
-from terrafusion.datasets.readers.sets.single_wheel import WheelTrials, read_wheel_trials
 from tests.studies.survey.published import FACTS, Fact, Value
+from tests.studies.twin_field.wheel_trials import TRIALS_FILE, WheelTrials, read_wheel_trials
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,8 @@ class Drives:
     @cached_property
     def logged(self) -> list[Recording]:
         """As the file has them: no convention of the catalogue applied."""
-        return list(format_of(self.path).read(Request(self.path, sha256=sha256_of(self.path))))
+        pinned = sha256_of(self.path) if self.path.is_file() else ""
+        return list(format_of(self.path).read(Request(self.path, sha256=pinned)))
 
     @cached_property
     def opened(self) -> list[Recording]:
@@ -141,9 +142,15 @@ def survey(names: str = "*") -> Iterator[Row]:
 
 
 def on_this_machine() -> list[tuple[str, Path]]:
-    """Name and first file of the catalogued recordings that are in `TERRAFUSION_DATA` or downloaded."""
-    found = ((name, _local(entries)) for name, entries in load_catalog().recordings().items())
+    """Name and first file of what is surveyed and is in `TERRAFUSION_DATA` or downloaded."""
+    found = ((name, _local(entries)) for name, entries in surveyed().items())
     return [(name, path) for name, path in found if path is not None]
+
+
+def surveyed() -> dict[str, list[CatalogFile]]:
+    """Files by name of the catalogued recordings, and of the trials of a single wheel."""
+    catalog = load_catalog()
+    return catalog.recordings() | {TRIALS_FILE: [file for file in catalog.files if file.file == TRIALS_FILE]}
 
 
 def markdown(rows: Sequence[Row]) -> str:

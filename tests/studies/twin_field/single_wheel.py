@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.files import unwritable
-from terrafusion.datasets.readers.sets.single_wheel import WheelTrials, read_wheel_trials
 from tests.studies.twin_field import single_wheel_scores as judge
 from tests.studies.twin_field.single_wheel_fit import FREE, OUTPUTS, Fit, fit, measured
+from tests.studies.twin_field.wheel_trials import WheelTrials, read_wheel_trials
 
 Array = NDArray[np.float64]
 

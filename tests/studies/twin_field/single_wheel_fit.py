@@ -1,6 +1,6 @@
 """The wheel model on a measured wheel: steady forces and sinkage of the single-wheel trials, and their fit.
 
-The trials are those of `datasets.single_wheel` (Pavlov and Johnson, CMU; MIT licence): a smooth wheel
+The trials are those of `wheel_trials` (Pavlov and Johnson, CMU; MIT licence): a smooth wheel
 pulled and pushed through dry sand at given slip and side-slip. The model takes slip, side-slip and load
 and predicts tractive force, side force and sinkage; the trials were slow (1 cm/s) and the model does not
 know speed, so it is evaluated at 1 m/s, above the speeds where its terms fade for a standing wheel.
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
+from tests.studies.twin_field.wheel_trials import WheelTrials
 
 Array = NDArray[np.float64]
 

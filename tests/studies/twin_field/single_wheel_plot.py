@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from tests.studies.twin_field.single_wheel_fit import conditions, measured
+from tests.studies.twin_field.wheel_trials import WheelTrials
 
 Array = NDArray[np.float64]
 

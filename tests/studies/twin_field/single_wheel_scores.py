@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.bootstrap import percentile_interval
-from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
@@ -22,6 +21,7 @@ from tests.studies.twin_field.single_wheel_fit import (
     measured,
     predict,
 )
+from tests.studies.twin_field.wheel_trials import WheelTrials
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,5 +1,5 @@
 """Trials of one wheel in a test bed (CMU, MATLAB v5): forces, sinkage, slip and side-slip, mean and spread of
-each trial. They are recognised as a log, but are no recording.
+each trial.
 """
 
 from __future__ import annotations
@@ -7,20 +7,16 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError, errors_of
-from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.sets.matlab_v5 import is_v5, read_structures, structures_with
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
+TRIALS_FILE = "cmu_single_wheel/all_smooth_data.mat"
+"""Name in the catalogue."""
 LARGEST = 1e6
 """No force in N, speed in mm/s or height in mm of the test bed is larger."""
 
@@ -93,12 +89,6 @@ class WheelTrials:
         """The arrays by name."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "notes"}
 
-    def to_pandas(self) -> pd.DataFrame:
-        """One row a trial, the columns named as the attributes."""
-        import pandas as pd
-
-        return pd.DataFrame(self.columns())
-
     def summary(self) -> dict[str, float | int | tuple[float, ...]]:
         """What the trials cover: counts, ranges (lowest, highest), and the side-slip angles asked for."""
         spans = {
@@ -122,7 +112,7 @@ def read_wheel_trials(path: Path | str) -> WheelTrials:
     heading, its z down; heights are negative in the soil. Speeds are in mm/s, angles in degrees.
 
     Raises:
-        DataError: the file is missing, broken, too large or holds no trials, or a trial lacks a number.
+        DataError: the file is missing, broken or holds no trials, or a trial lacks a number.
     """
     path = Path(path)
     if not path.is_file():
@@ -132,8 +122,8 @@ def read_wheel_trials(path: Path | str) -> WheelTrials:
 
 
 def _trials(path: Path) -> WheelTrials:
-    raw = read_structures(path, FIELDS)
-    columns = {name: _column(name, raw[name]) for name in FIELDS}
+    found = _structures(path)
+    columns = {name: _column(name, found[name]) for name in FIELDS}
     if not len(columns["slip"]):
         raise DataError("holds no trials", remedy="give the file as published")
     means = {f"{name}_{unit}": f * columns[f"avg_{key}"] for key, (name, unit, f) in _QUANTITIES.items()}
@@ -151,7 +141,24 @@ def _trials(path: Path) -> WheelTrials:
     )
 
 
-def _column(name: str, cells: list[Array]) -> Array:
+def _structures(path: Path) -> NDArray[Any]:
+    """The first array of structures (N,) with the trials' fields."""
+    import scipy.io
+
+    try:
+        variables = scipy.io.loadmat(path)
+    except (ValueError, TypeError, OSError, NotImplementedError) as error:
+        raise DataError(f"the MATLAB file cannot be read: {error}", remedy="copy it again") from None
+    for values in variables.values():
+        if isinstance(values, np.ndarray) and set(values.dtype.names or ()) >= FIELDS:
+            return values.ravel()
+    raise DataError(
+        f"holds no structures with {', '.join(sorted(FIELDS))}", remedy="give the file as published"
+    )
+
+
+def _column(name: str, raw: NDArray[Any]) -> Array:
+    cells = [np.ravel(cell).astype(float) if cell.dtype.kind in "iuf" else np.zeros(0) for cell in raw]
     bad = next((i for i, cell in enumerate(cells) if cell.shape != (1,) or not abs(cell[0]) < LARGEST), None)
     if bad is not None:
         raise DataError(
@@ -171,21 +178,3 @@ def _checked_slip(slip: Array, travel_mps: Array, rim_mps: Array) -> tuple[str, 
         return ()
     wrong = int((off > SLIP_TOLERANCE).sum())
     return (f"slip: off the speeds by up to {off.max():.2f}, in {wrong} of {len(off)} trials",)
-
-
-def claims(path: Path, head: bytes) -> bool:
-    """Whether it is a MATLAB v5 file with the trials' fields."""
-    return is_v5(head) and structures_with(path, FIELDS)
-
-
-def read(request: Request) -> NoReturn:
-    """Refuse, with the function that reads it.
-
-    Raises:
-        DataError: always.
-    """
-    trials = read_wheel_trials(request.path)
-    raise DataError(
-        f"holds {len(trials)} trials of a single wheel, not a drive",
-        remedy="`terrafusion inspect` sums them up; in Python, single_wheel.read_wheel_trials reads them",
-    )
