@@ -366,7 +366,7 @@ def test_a_writer_that_fails_leaves_what_was_there(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("terrafusion.datasets.writers.mcap_file._write_summary", fail)
+    monkeypatch.setattr("mcap.writer.Writer.finish", fail)
     (tmp_path / "a.mcap").write_text("precious")
     for name in ("a.mcap", "new.mcap"):
         with pytest.raises((TerrafusionError, KeyboardInterrupt)):
