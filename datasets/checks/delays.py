@@ -56,13 +56,13 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
         corrected = _on_one_clock(context)
         if corrected is not context:
             pairs = signal_pairs(CheckContext(without_stuck(corrected), context.rig))
-        lags, dragged = sensor_lags(pairs)
+        lags, wheels_slip = sensor_lags(pairs)
         off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
         if off:
             precise = {p for p, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[p]}
             off |= {p: lags[p] for p in precise - set(off) if _confirms(p, lags[p], off)}
             yield offset_finding(corrected.recording, off, precise | set(off))
-        elif not dragged:
+        elif not wheels_slip:
             yield from _late_fixes(corrected)
 
 
@@ -79,18 +79,18 @@ def _on_one_clock(context: CheckContext) -> CheckContext:
 
 
 def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
-    """Lags between sensors of the same motion, and whether the body is dragged by wheels that slip."""
-    lags, dragged = {}, False
+    """Lags between sensors of the same motion, and whether the wheels slip and drag the body after them."""
+    lags, wheels_slip = {}, False
     for pair, signals in pairs.items():
         lag = far_lag(*signals)
         if lag is None or lag.r < LEAST_R:
             continue
         suspect = _matters(pair, lag, *signals)
         if suspect and pair[1] == "wheels" and lag.seconds < 0.0 and _follows(lag, *signals):
-            dragged = True
+            wheels_slip = True
         elif not suspect or not opposed(lag, *signals):
             lags[pair] = _without_smoothing(lag, *signals) if suspect and pair[1] == "wheels" else lag
-    return lags, dragged
+    return lags, wheels_slip
 
 
 def _confirms(pair: Pair, lag: Lag, off: dict[Pair, Lag]) -> bool:

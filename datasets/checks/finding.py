@@ -73,7 +73,7 @@ class CheckContext:
 
 
 def once(of: Callable[[CheckContext], T]) -> Callable[[CheckContext], T]:
-    """A function that several checks call, computed once a context; nobody changes what it gives."""
+    """Caches a function's result in the context; callers must not modify it."""
 
     @functools.wraps(of)
     def kept(context: CheckContext) -> T:

@@ -61,7 +61,7 @@ BLOCK, LEAST_BLOCKS = 20, 4
 """Windows of a block of the bootstrap, and blocks that are needed."""
 LEAST_GAIN = 0.4
 """Measured acceleration over that of the wheels: a stuck robot only shakes with its wheels."""
-HANDED = 0.1
+LEAST_MIRROR_MARGIN = 0.1
 """By how much the correlation with the turns must differ from that with mirrored turns."""
 LEAST_ACCEL = 0.02
 """m/s2; a run at more constant speed determines nothing."""
@@ -245,7 +245,7 @@ def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> ForceHea
     if gain < LEAST_GAIN or best / power < max(LEAST_C, noise):
         return None
     apart = (abs(common) - abs(mirrored)) / power
-    side = float(np.sign(apart)) if abs(apart) > max(HANDED, noise) else 0.0
+    side = float(np.sign(apart)) if abs(apart) > max(LEAST_MIRROR_MARGIN, noise) else 0.0
     if side < 0.0:
         return ForceHeading(None, side)
     return ForceHeading(-float(np.angle(common)), side, _spread(measured * np.conj(predicted)))

@@ -44,23 +44,23 @@ def check_spans(context: CheckContext) -> Iterator[Finding]:
         name: [o for o, t in clocks.items() if t[0] > own[-1] or t[-1] < own[0]]
         for name, own in clocks.items()
     }
-    lonely = max(apart, key=lambda name: (len(apart[name]), clocks[name][0]), default="")
-    if not lonely or not apart[lonely]:
+    outlier = max(apart, key=lambda name: (len(apart[name]), clocks[name][0]), default="")
+    if not outlier or not apart[outlier]:
         return
-    own, others = clocks[lonely], [clocks[name] for name in clocks if name != lonely]
+    own, others = clocks[outlier], [clocks[name] for name in clocks if name != outlier]
     begins, ends = min(int(t[0]) for t in others), max(int(t[-1]) for t in others)
     late = own[0] > ends
     alike = abs(int(own[-1]) - int(own[0]) - (ends - begins)) <= SAME_SPAN * (ends - begins)
     yield Finding(
-        "no-common-time", "error", lonely,
-        f"begins after {' and '.join(apart[lonely])} ended" if late else "ended before the others begin",
+        "no-common-time", "error", outlier,
+        f"begins after {' and '.join(apart[outlier])} ended" if late else "ended before the others begin",
         f"it runs from {context.since_start_s(own[0]):.2f} to {context.since_start_s(own[-1]):.2f} s, "
         f"the others from {context.since_start_s(np.int64(begins)):.2f} "
         f"to {context.since_start_s(np.int64(ends)):.2f} s",
         "let it start with the others: they last equally long; correlation finds the remaining offset"
         if alike
         else "bring the channels onto one clock; their durations differ, so the offset is unknown",
-        _moved(lonely, begins - int(own[0])) if alike else None,
+        _moved(outlier, begins - int(own[0])) if alike else None,
     )  # fmt: skip
 
 

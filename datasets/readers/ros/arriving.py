@@ -23,7 +23,7 @@ from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch
-from terrafusion.datasets.readers.ros.streams import foreign, types_of
+from terrafusion.datasets.readers.ros.streams import broken_bag_on_error, types_of
 from terrafusion.datasets.readers.ros.topics import joints_given
 
 LIVE = Path("live")
@@ -64,8 +64,8 @@ class RawMessage:
         Raises:
             BagError: it does not fit its definition.
         """
-        with foreign(self.topic):
-            decoder = MessageDecoder(self.msgtype, live_types(self.msgtype), fields, cdr=True)
+        with broken_bag_on_error(self.topic):
+            decoder = MessageDecoder(self.msgtype, live_types(self.msgtype), fields, True, self.topic)
             decoder.add(_batch(0, [self]))
             receipt_ns, blocks = decoder.result()
         return Stream(self.topic, self.msgtype, receipt_ns, blocks)
@@ -146,7 +146,7 @@ class ArrivingMessages:
         for kind, topic in self.chosen.items():
             if (topic.name, topic.msgtype) == (message.topic, message.msgtype):
                 stream = self._stream(kind, message)
-                with errors_of(LIVE), foreign(message.topic):
+                with errors_of(LIVE), broken_bag_on_error(message.topic):
                     for sample in self._samples(kind, stream, self._time_of(stream), message):
                         t_ns = sample.t_ns[0] if isinstance(sample, Gnss) else sample.t_ns
                         found.append((int(t_ns), kind, sample))
@@ -222,9 +222,10 @@ class ArrivingMessages:
         """The messages of one topic, by a decoder that knows their layout already."""
         topic, msgtype = messages[0].topic, messages[0].msgtype
         decoder = self._decoders.pop(kind, None)
-        with foreign(topic):
+        with broken_bag_on_error(topic):
             if decoder is None:
-                decoder = MessageDecoder(msgtype, live_types(msgtype), wanted_fields(kind, msgtype), cdr=True)
+                fields = wanted_fields(kind, msgtype)
+                decoder = MessageDecoder(msgtype, live_types(msgtype), fields, True, topic)
             decoder.add(_batch(0, list(messages)))
             receipt_ns, blocks = decoder.result()
         self._decoders[kind] = decoder

@@ -19,7 +19,7 @@ from terrafusion.datasets.readers.ros.exact import META, restore
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.messages import Stream, twists, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
-from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
+from terrafusion.datasets.readers.ros.streams import Key, broken_bag_on_error, read_streams
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
 from terrafusion.datasets.readers.ros.topics import (
     FIX,
@@ -52,7 +52,7 @@ def opened_bag(
     """
     with errors_of(path):
         try:
-            with foreign():
+            with broken_bag_on_error():
                 container = open_container(path)
             with closing(container):
                 yield container

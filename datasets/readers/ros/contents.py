@@ -63,8 +63,8 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         candidates[kind] = tuple(topic.name for topic in found)
         return found[0]
 
-    doors = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
-    with opened_bag(path, *doors[form]) as container:
+    openers = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
+    with opened_bag(path, *openers[form]) as container:
         there = topics_of(container)
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
         streams = read_streams(container, {(t.name, t.msgtype): _fields_of(t) for t in usable})

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.ros.raw import BagError, Bytes, MessageBatch, rows_at
 
 Fields = Sequence[tuple[str, Any]]
@@ -184,12 +185,14 @@ class MessageDecoder:
         types: fields of that type and of those it is made of.
         wanted: paths of the fields to keep, with all below them; () for all.
         cdr: whether messages are in CDR, not in ROS 1's serialisation.
+        topic: its name, for errors.
     """
 
     msgtype: str
     types: Mapping[str, Fields]
     wanted: Sequence[str]
     cdr: bool
+    topic: str = ""
     count: int = 0
     _layouts: dict[int, list[MessageLayout]] = field(default_factory=dict)
     _pieces: dict[Any, list[MessageBlock]] = field(default_factory=dict)
@@ -200,7 +203,8 @@ class MessageDecoder:
         """Take in messages.
 
         Raises:
-            BagError: a message that does not fit its definition, or too many different layouts.
+            BagError: a message that does not fit its definition.
+            DataError: too many different layouts.
         """
         first = int(batch.sizes[0])
         sizes = [first] if (batch.sizes == first).all() else np.unique(batch.sizes).tolist()
@@ -218,7 +222,7 @@ class MessageDecoder:
                 layouts.append(
                     _Walk(raw[0].tobytes(), self.types, self.wanted, self.cdr).layout(self.msgtype)
                 )
-                self._refuse_chaos(layouts)
+                self._refuse_too_many_layouts(layouts)
             same = layouts[tried].holds(raw)
             if same.all():
                 self._keep(layouts[tried], raw, rows)
@@ -228,9 +232,15 @@ class MessageDecoder:
                 raw, rows = raw[~same], rows[~same]
             tried += 1
 
-    def _refuse_chaos(self, layouts: list[MessageLayout]) -> None:
-        if len(layouts) > MAX_LAYOUTS_OF_A_SIZE or sum(map(len, self._layouts.values())) > MAX_LAYOUTS:
-            raise BagError("hardly two messages have strings and lists of the same lengths")
+    def _refuse_too_many_layouts(self, layouts: list[MessageLayout]) -> None:
+        of_a_size = len(layouts) > MAX_LAYOUTS_OF_A_SIZE
+        if of_a_size or sum(map(len, self._layouts.values())) > MAX_LAYOUTS:
+            most = f"{MAX_LAYOUTS_OF_A_SIZE} (in messages of one size)" if of_a_size else f"{MAX_LAYOUTS}"
+            raise DataError(
+                f"its texts and lists have more than {most} combinations of lengths",
+                channel=self.topic or None,
+                remedy="leave the topic out of the bag, or publish texts and lists of the same lengths",
+            )
 
     def _keep(self, layout: MessageLayout, raw: Bytes, rows: NDArray[np.int64]) -> None:
         records: NDArray[Any] = raw.view(layout.dtype)[:, 0] if layout.dtype.names else raw

@@ -23,7 +23,7 @@ _DECODED = ContextVar("streams decoded once", default=None)
 
 
 @contextmanager
-def foreign(topic: str | None = None) -> Iterator[None]:
+def broken_bag_on_error(topic: str | None = None) -> Iterator[None]:
     """Around parsers: the bytes are of unknown origin, so whatever they raise, the bag is broken."""
     try:
         yield
@@ -81,19 +81,18 @@ def decode_streams(
             if (source.topic, source.msgtype) == key:
                 alike.setdefault((source.definition, source.language, source.encoding), []).append(source)
         for sources in alike.values():
-            with foreign(key[0]):
-                decoders.append(
-                    (key, MessageDecoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0])))
-                )
+            with broken_bag_on_error(key[0]):
+                cdr = _is_cdr(sources[0])
+                decoders.append((key, MessageDecoder(key[1], types_of(sources[0]), fields, cdr, key[0])))
             groups.append([source.id for source in sources])
     batches = container.batches(groups)
     while True:
-        with foreign():
+        with broken_bag_on_error():
             batch = next(batches, None)
         if batch is None:
             break
         key, decoder = decoders[batch.group]
-        with foreign(key[0]):
+        with broken_bag_on_error(key[0]):
             decoder.add(batch)
         if enough is not None and decoder.count >= enough:
             break

@@ -16,12 +16,13 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, decompress, zstd
 from terrafusion.datasets.readers.ros.ros1 import Ros1File
 from terrafusion.datasets.readers.ros.ros2 import open_container
 from terrafusion.datasets.readers.ros.streams import read_streams
+from tests.datasets.ros_bags import MAKE1, write_ros1
 from tests.datasets.ros_bits import ROS1, ROS2, T0, assert_same, imu, serialized
 
 MIX = (("/imu", "sensor_msgs/msg/Imu", 5), ("/js", "sensor_msgs/msg/JointState", 20),
@@ -275,3 +276,15 @@ def test_a_damaged_definition_is_not_quoted_whole(tmp_path: Path) -> None:
         open_recording(path)
     assert len(str(refused.value)) < 600
     assert "\n" not in str(refused.value)
+
+
+def test_messages_that_are_all_laid_out_differently(tmp_path: Path) -> None:
+    """A cache of layouts is bounded: names of two joints, together of one length, but each time another."""
+    pairs = [["a" * k, "b" * (120 - k)] for k in range(1, 120)]
+    messages = [
+        ("/joints", "sensor_msgs/msg/JointState", T0 + k, MAKE1.joints(T0 + k, pair, [0.0] * 2, [1.0] * 2))
+        for k, pair in enumerate(pairs)
+    ]
+    path = write_ros1(tmp_path / "a.bag", messages)
+    with pytest.raises(DataError, match=r"a\.bag, /joints: .*more than 100 \(in.*; leave the topic out"):
+        open_recording(path)
