@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = (
-    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "gap", "study",
+    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "gap",
     "allan", "replay", "live", "terrain", "policy", "gap-blind",
 )  # fmt: skip
 

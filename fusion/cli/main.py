@@ -31,7 +31,6 @@ from terrafusion.fusion.cli import (
     replay,
     self_check,
     simulate,
-    study,
     sweep,
     terrain,
 )
@@ -84,7 +83,6 @@ add_command(app, "fetch", fetch.fetch)
 add_command(app, "allan", allan.allan)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")
-add_command(app, "study", study.study, output=study.OUTPUT)
 add_command(app, "benchmark", benchmark.benchmark, output=benchmark.OUTPUT)
 add_command(app, "gap-blind", gap_blind.gap_blind, output=gap_blind.OUTPUT)
 add_command(app, "completion", completion.completion, as_json=False)

@@ -13,7 +13,7 @@ EXTRAS = {
     "parquet": ("pyarrow", "`terrafusion sweep`"),
     "learn": ("sklearn", "`terrain train LOGS` and `terrain eval LOGS`"),
     "rerun": ("rerun", "`replay --rerun`, for the Rerun viewer"),
-    "cluster": ("distributed", "`--backend dask` of sweep, study, benchmark, gap-blind and terrain train"),
+    "cluster": ("distributed", "`--backend dask` of sweep, benchmark, gap-blind and terrain train"),
     "live": ("cyclonedds", "`live` on a robot, over DDS"),
     "foxglove": ("foxglove", "`live --foxglove`"),
 }

@@ -45,16 +45,17 @@ class Tile:
 
 def write_page(
     path: Path,
-    template: str,
+    template: str | Path,
     title: str,
     *,
     provenance: Mapping[str, object] | None = None,
     packages: Sequence[str] = LIBRARIES,
     **values: Any,
 ) -> Path:
-    """Write the report that `template` (a file of `templates/`) makes of `values` to `path`.
+    """Write the report that `template` makes of `values` to `path`.
 
     Args:
+        template: name of a file of `templates/`, or the path of another.
         provenance: lines of the last section, which also lists the versions of `packages`.
 
     Raises:
@@ -62,7 +63,12 @@ def write_page(
     """
     versions = ", ".join(f"{name} {version}" for name, version in versions_of(packages).items())
     made_by = dict(provenance or {}) | {"versions": versions}
-    page = _environment().get_template(template).render(title=title, provenance=made_by, **values)
+    pages = _environment()
+    if isinstance(template, Path):
+        found = pages.from_string(template.read_text("utf-8"))
+    else:
+        found = pages.get_template(template)
+    page = found.render(title=title, provenance=made_by, **values)
     return write_text(path, page)
 
 

@@ -125,7 +125,7 @@ REFUSED = (
 )  # fmt: skip
 COMMANDS = (
     "", "demo", "inspect", "fetch", "convert", "simulate", "sweep", "benchmark", "calibrate", "gap",
-    "gap-blind", "study", "replay", "terrain train", "terrain eval", "policy fit",
+    "gap-blind", "replay", "terrain train", "terrain eval", "policy fit",
 )  # fmt: skip
 QUICK = {
     "log/eight", "replay/eight-adaptive", "replay/eight-adaptive-batch", "replay/t17-adaptive",
@@ -164,7 +164,6 @@ def all_cases() -> list[Case]:
         words = f"simulate short.yaml --seed {seed} {worn.get(seed, '')}"
         found[f"log/short-{seed}"] = [f"{words} --out {{out}}/log"]
     found["benchmark"] = ["benchmark --quick --only firm=1 --only outages=1 --jobs 1 --out {out}/b"]
-    found["study"] = ["study --quick --jobs 1 --out {out}/s"]
     found["demo"] = ["demo --out {out}/d"]
     found["gap/null"] = [f"gap {short.format(11)} {references} --terrain asphalt --out {{out}}/g"]
     found["gap/effect"] = [

@@ -82,12 +82,18 @@ TWIN = (
     Study(
         "source_study",
         "Does the twin reproduce the source study?",
-        ("terrafusion", "study", "--out", OUT),
+        module("source_study.command", "--out", OUT),
         8,
         {
-            "agree": r".*?(\d+) agree",
-            "partly": r".*?(\d+) partly",
-            "disagree": r".*?(\d+) disagree",
+            **{word: rf"- of all claims .*?(\d+) {word}" for word in ("agree", "partly", "disagree")},
+            **{
+                f"predicted_{word}": rf"- of those neither .*?(\d+) {word}"
+                for word in ("agree", "partly", "disagree")
+            },
+            **{
+                f"tab4_{terrain}": rf"quoted of {terrain}: (.*)"
+                for terrain in ("mud", "loose_sand", "medium_sand")
+            },
         },
         spread=True,
     ),

@@ -48,7 +48,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "gap": ("gap", "log", "--effects", "wheel_radius,gyro_bias", "--out", "out/run"),
     "benchmark": ("benchmark", "--only", "firm=1", "--jobs", "1", "--out", "out/run"),
     "init": ("init", "log", "--track", "0.62", "--out", "out/robot.yaml", "--force"),
-    "study": ("study", "--quick", "--seeds", "1", "--jobs", "1", "--out", "out/run"),
     "gap-blind": ("gap-blind", "--quick", "--no-opponent", "--out", "out/run"),
     "policy fit": ("policy", "fit", "--seeds", "1", "--ground", "asphalt", "--out", "out/policy.yaml"),
     "terrain train": ("terrain", "train", "--seeds", "1", "--jobs", "1", "--out", "out/model.yaml"),

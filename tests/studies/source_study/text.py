@@ -1,16 +1,16 @@
-"""The reproduced study as lines of text and as Markdown."""
+"""The reproduced study as Markdown."""
 
 import itertools
 from collections.abc import Sequence
 
-from terrafusion.datasets.core.tables import markdown_table, text_table
+from terrafusion.datasets.core.tables import markdown_table
 from terrafusion.twin.analysis.speeds import OTHERS, USUAL
-from terrafusion.twin.study.cases import CaseRun
-from terrafusion.twin.study.claims import PREDICTED, ClaimResult, counts
-from terrafusion.twin.study.gnss_noise import DATA_SHEET_M, rate_for
-from terrafusion.twin.study.published import CASES, StudyCase
-from terrafusion.twin.study.spread import spread
-from terrafusion.twin.study.study import Study
+from tests.studies.source_study.cases import CaseRun
+from tests.studies.source_study.claims import PREDICTED, ClaimResult, counts
+from tests.studies.source_study.gnss_noise import DATA_SHEET_M, rate_for
+from tests.studies.source_study.published import CASES, StudyCase
+from tests.studies.source_study.spread import spread
+from tests.studies.source_study.study import Study
 
 TAB4_HEAD = ("", "|s|", "odometry", "IMU", "GNSS, RTK", "GNSS, Gaussian", "stopped for good at")
 ASSUMED_COLUMNS = ("slip", "imu", "gnss")
@@ -23,14 +23,6 @@ ASSUMED_HEAD = (
 )
 COLUMNS = ("source", "statement", "quantity", "study", "twin", "verdict", "criterion", "basis", "why")
 """Columns of the table of agreement, fields of `ClaimResult`."""
-
-
-def study_lines(study: Study) -> list[str]:
-    """Tab. 4 side by side, the GNSS noise, and how much agrees."""
-    seeds = study.plan.seed_count()
-    lines = [f"mean %, twin / study; {seeds} seeds, 95 % interval of the mean"]
-    lines += text_table(TAB4_HEAD, [[case.label, *table_cells(study, case)] for case in CASES])
-    return [*lines, "", noise_sentence(study), *count_lines(study.rows)]
 
 
 def table_cells(study: Study, case: StudyCase) -> list[str]:
@@ -102,7 +94,7 @@ def markdown_rows(rows: Sequence[ClaimResult]) -> list[str]:
 
 
 def document_section(study: Study) -> list[str]:
-    """What tests/studies/results/source_study.md holds between its marks: its tables and counts."""
+    """Tables and counts, as the stored result tests/studies/results/source_study.md holds them."""
     tab4 = [[case.label, *table_cells(study, case)] for case in CASES]
     return [
         *markdown_table(("mean %, twin / study", *TAB4_HEAD[1:]), tab4),
@@ -117,3 +109,12 @@ def document_section(study: Study) -> list[str]:
         "",
         *markdown_rows(study.rows),
     ]
+
+
+def quoted_lines(study: Study) -> list[str]:
+    """Rows of Tab. 4 as docs/evidence/study.md quotes them: without the Gaussian GNSS noise."""
+    lines = []
+    for case in CASES:
+        *errors, _, stopped = table_cells(study, case)
+        lines.append(f"quoted of {case.terrain}: {' | '.join([*errors, stopped])}")
+    return lines

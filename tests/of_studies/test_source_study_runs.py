@@ -11,11 +11,11 @@ from terrafusion.datasets.core.channels import Imu
 from terrafusion.twin.analysis import speeds as processing
 from terrafusion.twin.analysis.speeds import Profiles, differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study import measures
-from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
-from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
-from terrafusion.twin.study.published import CASES, platform_figures
-from terrafusion.twin.study.spread import spread
+from tests.studies.source_study import measures
+from tests.studies.source_study.cases import UNEVEN, CaseRun, run_case
+from tests.studies.source_study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
+from tests.studies.source_study.published import CASES, platform_figures
+from tests.studies.source_study.spread import spread
 
 MUD, LOOSE, MEDIUM = CASES
 

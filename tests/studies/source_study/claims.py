@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.twin.study.spread import Spread
+from tests.studies.source_study.spread import Spread
 
 AGREE, PARTLY, DISAGREE = "agree", "partly", "disagree"
 VERDICTS = (AGREE, PARTLY, DISAGREE)
@@ -120,8 +120,7 @@ def load_claims() -> tuple[Claim, ...]:
     """All claims, in the order of the study's tables and figures."""
     claims: list[Claim] = []
     for name in FILES:
-        with resources.as_file(resources.files("terrafusion.twin.study") / name) as path:
-            claims += [_claim(dict(row)) for row in read_yaml(path)["claims"]]
+        claims += [_claim(dict(row)) for row in read_yaml(Path(__file__).parent / name)["claims"]]
     return tuple(claims)
 
 

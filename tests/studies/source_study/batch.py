@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.study.published import FRICTION, SCENARIO, VEHICLE
+from tests.studies.source_study.published import FRICTION, SCENARIO, VEHICLE
 
 SLOPES_DEG = (0.0, 5.0, 10.0, 15.0)
 PAYLOADS_KG = (0.0, 30.0, 60.0)

@@ -1,9 +1,4 @@
-"""`run_study`: the source study, reproduced by the twin from one plan.
-
-from terrafusion.twin.study.study import StudyPlan, run_study
-study = run_study(StudyPlan(seeds=10, jobs=2))
-study.rows          # the table of agreement
-"""
+"""`run_study`: the source study, reproduced by the twin from one plan."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +6,13 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.executors import Workers, open_workers
-from terrafusion.twin.study.batch import BatchResult, grid, run_cell, slip_cells
-from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
-from terrafusion.twin.study.claims import ClaimResult, judge, load_claims
-from terrafusion.twin.study.field_drive import FieldDrive, drive_field
-from terrafusion.twin.study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_noise
-from terrafusion.twin.study.published import CASES, StudyCase
-from terrafusion.twin.study.quantities import (
+from tests.studies.source_study.batch import BatchResult, grid, run_cell, slip_cells
+from tests.studies.source_study.cases import UNEVEN, CaseRun, run_case
+from tests.studies.source_study.claims import ClaimResult, judge, load_claims
+from tests.studies.source_study.field_drive import FieldDrive, drive_field
+from tests.studies.source_study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_noise
+from tests.studies.source_study.published import CASES, StudyCase
+from tests.studies.source_study.quantities import (
     Quantities,
     batch_quantities,
     case_quantities,

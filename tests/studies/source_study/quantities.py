@@ -3,8 +3,8 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from terrafusion.twin.study import measures
-from terrafusion.twin.study.batch import (
+from tests.studies.source_study import measures
+from tests.studies.source_study.batch import (
     SLIP_SLOPE_DEG,
     BatchResult,
     least_growth,
@@ -12,11 +12,11 @@ from terrafusion.twin.study.batch import (
     slip_cost,
     steepening,
 )
-from terrafusion.twin.study.cases import CaseRun
-from terrafusion.twin.study.field_drive import FieldDrive, field_measures
-from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, least_ratio
-from terrafusion.twin.study.published import CASES, FRICTION, platform_figures
-from terrafusion.twin.study.spread import Spread, spread
+from tests.studies.source_study.cases import CaseRun
+from tests.studies.source_study.field_drive import FieldDrive, field_measures
+from tests.studies.source_study.gnss_noise import NoiseFit, NoisyRun, least_ratio
+from tests.studies.source_study.published import CASES, FRICTION, platform_figures
+from tests.studies.source_study.spread import Spread, spread
 
 Runs = Mapping[str, Sequence[CaseRun]]
 Quantities = dict[str, Spread]

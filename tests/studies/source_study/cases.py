@@ -13,7 +13,7 @@ from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.study.published import SCENARIO, VEHICLE, StudyCase
+from tests.studies.source_study.published import SCENARIO, VEHICLE, StudyCase
 
 UNEVEN = Variation(strength_sigma=0.2, length_m=0.5)
 """Ground on which left and right wheels differ. Assumed: the study's ground was even, its contacts were not.

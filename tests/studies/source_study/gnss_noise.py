@@ -24,7 +24,7 @@ from terrafusion.twin.analysis.speeds import (
     match,
     mean_percent,
 )
-from terrafusion.twin.study.cases import CaseRun
+from tests.studies.source_study.cases import CaseRun
 
 RATES_HZ = (1.0, 5.0, 10.0, 100.0)  # rates at which positions may have been differenced; the study names none
 SIGMAS_M = (1e-4, 10.0)  # sizes of noise that are searched

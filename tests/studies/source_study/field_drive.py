@@ -17,7 +17,7 @@ from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study.published import VEHICLE
+from tests.studies.source_study.published import VEHICLE
 
 SCENARIO = "field_sand"
 HIGH_HZ = 2.0  # above this the robot's own speed profile holds nothing: what is faster is vibration and shock

@@ -6,7 +6,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.twin.analysis.speeds import MOVING_MPS, Profiles, mean_percent
-from terrafusion.twin.study.cases import CaseRun, between, set_off_s, stopped_s
+from tests.studies.source_study.cases import CaseRun, between, set_off_s, stopped_s
 
 RAMP_S = 4.0  # after a stop the robot needs this long to reach the command within its limit of acceleration
 SINKING_S = 10.0  # before it stops for good on mud, the robot follows the command until this long before

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.study.claims import (
+from tests.studies.source_study.claims import (
     AGREE,
     BASES,
     DISAGREE,
@@ -23,10 +23,10 @@ from terrafusion.twin.study.claims import (
     judge,
     load_claims,
 )
-from terrafusion.twin.study.published import CASES
-from terrafusion.twin.study.spread import Spread, spread
-from terrafusion.twin.study.study import StudyPlan, run_study
-from terrafusion.twin.study.text import COLUMNS, markdown_rows
+from tests.studies.source_study.published import CASES
+from tests.studies.source_study.spread import Spread, spread
+from tests.studies.source_study.study import StudyPlan, run_study
+from tests.studies.source_study.text import COLUMNS, markdown_rows
 
 
 def runs(*values: float) -> Spread:

@@ -9,11 +9,11 @@ import numpy as np
 
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
-from terrafusion.twin.study.batch import BatchResult
-from terrafusion.twin.study.cases import CaseRun
-from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun
-from terrafusion.twin.study.published import CASES
-from terrafusion.twin.study.spread import spread
+from tests.studies.source_study.batch import BatchResult
+from tests.studies.source_study.cases import CaseRun
+from tests.studies.source_study.gnss_noise import NoiseFit, NoisyRun
+from tests.studies.source_study.published import CASES
+from tests.studies.source_study.spread import spread
 
 SPEED, ENERGY = "speed, m/s", "energy, J/m"
 WHEELS, GNSS = style.SENSOR_COLOURS["wheels"], style.SENSOR_COLOURS["gnss"]

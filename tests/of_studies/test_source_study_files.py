@@ -1,24 +1,30 @@
-"""`study`: the source study reproduced by one command, and the document made from it."""
+"""The files of the reproduced source study, and the stored result made from it."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from terrafusion.twin.study import study as study_module
-from terrafusion.twin.study.batch import BatchCell, slip_cells
-from terrafusion.twin.study.claims import AGREE, NOT_EXAMINED, VERDICTS, load_claims
-from terrafusion.twin.study.published import CASES, FRICTION
-from terrafusion.twin.study.text import COLUMNS
+from terrafusion.datasets.core.errors import ConfigError
 from tests.fusion.reports.browser import assert_drawn
+from tests.studies.__main__ import first
+from tests.studies.registry import STUDIES
+from tests.studies.source_study import command
+from tests.studies.source_study import study as study_module
+from tests.studies.source_study.batch import BatchCell, slip_cells
+from tests.studies.source_study.claims import AGREE, NOT_EXAMINED, VERDICTS, load_claims
+from tests.studies.source_study.published import CASES, FRICTION
+from tests.studies.source_study.study import StudyPlan
+from tests.studies.source_study.text import COLUMNS
 
-DOCUMENT = Path(__file__).parents[2] / "studies" / "results" / "source_study.md"
+DOCUMENT = Path(__file__).parents[1] / "studies" / "results" / "source_study.md"
 FIXED = {"source", "statement", "quantity", "study", "criterion", "basis"}
 """Columns of the table that no run changes."""
 
@@ -26,10 +32,6 @@ FIXED = {"source", "statement", "quantity", "study", "criterion", "basis"}
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
     """The folder of a study with one seed and nine cells, and what was printed."""
-    from typer.testing import CliRunner
-
-    from terrafusion.fusion.cli.main import app
-
     cells = [
         BatchCell(terrain, mu, slope)
         for terrain, ends in FRICTION.items()
@@ -40,10 +42,10 @@ def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path,
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study_module, "grid", lambda quick: (*cells, heavy))
         patch.setattr(study_module, "slip_cells", lambda quick: slip_cells(quick=True))
-        words = ["study", "--out", str(folder), "--quick", "--seeds", "1", "--jobs", "1"]
-        result = CliRunner().invoke(app, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return folder, result.output
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            assert command.main(["--out", str(folder), "--quick", "--seeds", "1"]) == 0
+    return folder, printed.getvalue()
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -53,7 +55,7 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 def documented() -> list[dict[str, str]]:
     """The table of agreement in the stored result."""
-    lines = DOCUMENT.read_text(encoding="utf-8").split("<!-- agreement:start -->")[1].splitlines()
+    lines = DOCUMENT.read_text(encoding="utf-8").splitlines()
     head = f"| {' | '.join(COLUMNS)} |"
     table = lines[lines.index(head) + 2 :]
     rows = []
@@ -67,12 +69,11 @@ def documented() -> list[dict[str, str]]:
 
 def test_its_files(reproduced: tuple[Path, str]) -> None:
     folder, out = reproduced
-    names = {"plan.json", "agreement.csv", "agreement.md", "metrics.json", "batch.csv", "report.html"}
-    assert {path.name for path in folder.iterdir()} == names | {"config.json"}
-    assert out.splitlines()[-1] == f"report: {folder / 'report.html'}"
+    names = {"agreement.csv", "metrics.json", "batch.csv", "report.html"}
+    assert {path.name for path in folder.iterdir()} == names
     for case in CASES:
         assert case.label in out
-    assert json.loads((folder / "plan.json").read_text())["seeds"] == 1
+    assert json.loads((folder / "metrics.json").read_text())["seeds"] == 1
 
 
 def test_every_claim_is_judged(reproduced: tuple[Path, str]) -> None:
@@ -140,9 +141,16 @@ def test_the_numbers_of_the_document_still_hold(reproduced: tuple[Path, str]) ->
     assert checked >= 10
 
 
-def test_wrong_requests_are_refused_in_one_line(tmp_path: Path, terrafusion) -> None:
-    assert terrafusion("study", "--out", tmp_path / "out", "--seeds", 0).refused("seeds", "1 to 1000")
-    (tmp_path / "file").write_text("in the way")
-    assert terrafusion("study", "--out", tmp_path / "file").refused("file")
-    assert terrafusion("study", "--out", tmp_path, "--jobs", 0).status == 2
-    assert os.listdir(tmp_path) == ["file"]
+def test_the_registry_reads_every_quoted_figure(reproduced: tuple[Path, str]) -> None:
+    (study,) = (one for one in STUDIES if one.name == "source_study")
+    stored = json.loads(DOCUMENT.with_suffix(".json").read_text(encoding="utf-8"))["figures"]
+    assert study.figures.keys() == stored.keys()
+    for name, pattern in study.figures.items():
+        found = first(pattern, reproduced[1])
+        assert found is not None, name
+        assert found.count("|") == stored[name].count("|")
+
+
+def test_too_few_seeds_are_refused() -> None:
+    with pytest.raises(ConfigError, match="1 to 1000"):
+        StudyPlan(seeds=0).seed_count()

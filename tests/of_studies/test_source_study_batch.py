@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from terrafusion.twin.study.batch import (
+from tests.studies.source_study.batch import (
     BatchCell,
     BatchResult,
     grid,
@@ -17,7 +17,7 @@ from terrafusion.twin.study.batch import (
     slip_cost,
     steepening,
 )
-from terrafusion.twin.study.published import FRICTION
+from tests.studies.source_study.published import FRICTION
 
 
 def result(energy: float, slip: float = 1.0, advance: float = 1.0, **cell: float) -> BatchResult:

@@ -10,7 +10,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Sheet
-from terrafusion.twin.study.field_drive import FieldDrive
+from tests.studies.source_study.field_drive import FieldDrive
 
 GAP_S = 1.0
 """No line is drawn over a longer time without fixes."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.twin.study.study import StudyPlan, run_study
-from terrafusion.twin.study.text import study_lines
+from tests.studies.source_study.study import StudyPlan, run_study
+from tests.studies.source_study.text import document_section
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 
@@ -29,5 +29,5 @@ def test_a_worker_killed_in_the_middle_changes_nothing(tmp_path: Path) -> None:
 
         there = run_study(PLAN, kill_one, backend="dask", address=address)
     assert shares[-1] == 1.0
-    assert study_lines(there) == study_lines(here)
+    assert document_section(there) == document_section(here)
     assert there.measured == here.measured

@@ -1,8 +1,6 @@
 """The files of a reproduced study.
 
-plan.json        what was asked for, written before the runs: a folder that cannot be written fails at once
 agreement.csv    one row a statement of the study, with its verdict
-agreement.md     the same as the Markdown of the stored result, tests/studies/results/source_study.md
 metrics.json     everything measured, with intervals; the plan; the counts
 batch.csv        one row a run of the batch
 report.html      all of it, with the figures
@@ -19,38 +17,27 @@ from typing import Any
 
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
-from terrafusion.fusion.reports.plots import study as plots
-from terrafusion.fusion.reports.plots import study_field as field
 from terrafusion.fusion.reports.plots.sheet import Sheet
-from terrafusion.twin.study.batch import BatchResult
-from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
-from terrafusion.twin.study.published import CASES, FRICTION, SCENARIO, TITLE, VEHICLE, platform_figures
-from terrafusion.twin.study.study import Study, StudyPlan
-from terrafusion.twin.study.text import (
+from tests.studies.source_study import plots
+from tests.studies.source_study import plots_field as field
+from tests.studies.source_study.batch import BatchResult
+from tests.studies.source_study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
+from tests.studies.source_study.published import CASES, FRICTION, TITLE, platform_figures
+from tests.studies.source_study.study import Study
+from tests.studies.source_study.text import (
     ASSUMED_HEAD,
     TAB4_HEAD,
     assumed_rows,
-    document_section,
     noise_sentence,
     table_cells,
 )
 
+TEMPLATE = Path(__file__).parent / "study.html.j2"
 SCHEMA = "terrafusion.study/1"
 BATCH_COLUMNS = (
     "terrain", "friction", "slope_deg", "payload_kg", "shear_modulus_m", "mobile", "advance", "slip_percent",
     "slip_ratio_percent", "energy_per_m_j", "immobilised_at_s",
 )  # fmt: skip
-
-
-def write_plan(out: Path, plan: StudyPlan) -> None:
-    """Write `plan.json`.
-
-    Raises:
-        ConfigError: the plan asks for no or too many seeds.
-        TerrafusionError: the folder cannot be written.
-    """
-    content = {"scenario": SCENARIO, "vehicle": VEHICLE, "seeds": plan.seed_count(), "quick": plan.quick}
-    write_text(out / "plan.json", to_json(content, indent=2) + "\n")
 
 
 def write_study(out: Path, study: Study, provenance: Mapping[str, object] | None = None) -> None:
@@ -62,27 +49,12 @@ def write_study(out: Path, study: Study, provenance: Mapping[str, object] | None
     columns = [field.name for field in dataclasses.fields(ClaimResult)]
     texts = {
         "agreement.csv": _csv(columns, map(dataclasses.asdict, study.rows)),
-        "agreement.md": "\n".join(document_section(study)) + "\n",
         "metrics.json": to_json(metrics_of(study), indent=2) + "\n",
         "batch.csv": _csv(BATCH_COLUMNS, map(batch_row, (*study.batch, *study.over_slip))),
     }
     for name, text in texts.items():
         write_text(out / name, text)
     _write_page(out / "report.html", study, provenance)
-
-
-def write_bags(out: Path) -> None:
-    """The three cases with seed 0 as ROS 2 bags with sensors, command and ground truth.
-
-    Raises:
-        TerrafusionError: the folder cannot be written.
-    """
-    from terrafusion.datasets.writers.mcap import write_mcap
-    from terrafusion.twin.simulate import simulate
-
-    for case in CASES:
-        recording = simulate(SCENARIO, vehicle=VEHICLE, terrain=case.terrain, slope_deg=case.slope_deg)
-        write_mcap(recording, out / f"{case.terrain}.mcap")
 
 
 def metrics_of(study: Study) -> dict[str, Any]:
@@ -134,7 +106,7 @@ def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | Non
     ]
     disagreeing = [row for verdict in VERDICTS[:0:-1] for row in study.rows if row.verdict == verdict]
     write_page(
-        path, "study.html.j2", "The source study, reproduced", lead=lead, provenance=provenance,
+        path, TEMPLATE, "The source study, reproduced", lead=lead, provenance=provenance,
         verdicts=[VerdictBox("doubtful" if disagreeing else "good", title, [reason])], tiles=tiles[:3],
         packages=TWIN_LIBRARIES, noise=noise_sentence(study),
         tab4_heads=TAB4_HEAD, tab4=[(case.label, *table_cells(study, case)) for case in CASES],
