@@ -98,10 +98,8 @@ def evaluate(
 ) -> Result:
     """Score a terrain model on new simulated runs, or a classifier on labelled logs, cross-validated by run.
 
-    With logs: five folds of whole runs; delay of detecting changes of ground,
-    ablation of feature groups, unseen grounds, and a leaking split for
-    comparison. With logs and a model: its scores on these logs, which must not
-    be those of its training.
+    With logs: five folds of whole runs. With logs and a model: its scores on
+    these logs, which must not be those of its training.
 
     Example: terrafusion terrain eval
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
@@ -134,11 +132,9 @@ def evaluate(
 def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> Result:
     """Cross-validate labelled logs; write the scores where asked for."""
     from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
-    from terrafusion.fusion.training.surface_report import STEPS, lines_of, report_on
+    from terrafusion.fusion.training.surface_report import lines_of, report_on
 
-    runs, others = open_runs(logs), open_runs(test) if test else []
-    with progress("steps", STEPS) as tick:
-        report = report_on(runs, others, tick)
+    report = report_on(open_runs(logs), open_runs(test) if test else [])
     return scored(report | {"inputs": hashes_of([*logs, *test])}, lines_of(report), out)
 
 

@@ -2,9 +2,9 @@
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ MAX_PATCH_WINDOWS = 80
 SETTLING_S = 3.0
 """Driving after a change of ground in which a switch of the detector does not count as false."""
 MIN_SCORED_PATCH_S = 5.0
+Run = TypeVar("Run")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +59,23 @@ class DetectorScores:
     windows: int
 
 
+def drawn_patches(runs: Sequence[tuple[Run, str]], rng: np.random.Generator) -> Iterator[tuple[str, Run]]:
+    """Without end: another ground than that before, and one of its runs; the caller may draw in between."""
+    grounds, last = sorted({ground for _, ground in runs}), ""
+    while True:
+        last = str(rng.choice([ground for ground in grounds if ground != last]))
+        choices = [run for run, ground in runs if ground == last]
+        yield last, choices[int(rng.integers(len(choices)))]
+
+
 def splice(runs: Sequence[tuple[list[Window], str]], patches: int, seed: int) -> LabelledRoute:
     """One long route over `patches` grounds, cut from runs (windows, ground) on one ground each."""
     rng = np.random.default_rng([seed, 11])
-    grounds = sorted({ground for _, ground in runs})
     moving = [(w, g) for w, g in runs if sum(x.ground_speed_mps() > MIN_SPEED_MPS for x in w) > 10]
     windows: list[Window] = []
     labels: list[str] = []
     starts: list[int] = []
-    last = ""
-    for _ in range(patches):
-        ground = str(rng.choice([g for g in grounds if g != last]))
-        choices = [w for w, g in moving if g == ground]
-        source = choices[int(rng.integers(len(choices)))]
+    for ground, source in itertools.islice(drawn_patches(moving, rng), patches):
         begin = int(rng.integers(max(len(source) - 20, 1)))
         length_m = PATCH_M[0] + rng.exponential(PATCH_M[1])
         driven = np.cumsum([w.ground_speed_mps() * UPDATE_S for w in source[begin:]])
@@ -78,7 +83,6 @@ def splice(runs: Sequence[tuple[list[Window], str]], patches: int, seed: int) ->
         starts.append(len(windows))
         windows += part
         labels += [ground] * len(part)
-        last = ground
     return LabelledRoute(windows, np.array(labels), starts)
 
 

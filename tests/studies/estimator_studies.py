@@ -184,6 +184,17 @@ ESTIMATOR = (
         },
     ),
     Study(
+        "ground_features",
+        "What carries the classification of a robot's own grounds, and is a ground never seen called new?",
+        module("ground_classifier.experiments"),
+        10,
+        {
+            "all_features": r"nothing +([\d.]+)",
+            "forest_by_run": r"extra trees, .* by run ([\d.]+)",
+            "forest_leaking": r"windows of one run .*extra trees ([\d.]+)",
+        },
+    ),
+    Study(
         "slip_model",
         "Can wheels and IMU alone predict slip on a robot, soil or data set that nothing was fitted to?",
         module("slip_model.study"),

@@ -9,16 +9,15 @@ on. The limit of the alarm was chosen on routes with seeds 0 to 9; these have ot
 from __future__ import annotations
 
 from terrafusion.fusion.benchmark.field_logs import catalogued
-from terrafusion.fusion.training.change_detection import changes_seen
-from terrafusion.fusion.training.cross_validation import cross_validate, open_runs
+from terrafusion.fusion.training.cross_validation import LabelledRun, cross_validate, open_runs
+from tests.studies.ground_classifier.change_detection import changes_seen
 
 FIRST_SEED = 1000
 
 
 def main() -> int:
     """Train on each fold, splice routes, print."""
-    names = [name for name in catalogued() if name.startswith("borealtc/")]
-    folded = cross_validate(open_runs([name for name in names if has_imu(name)]))
+    folded = cross_validate(labelled_runs())
     held_out = [
         [(run.signals, run.label) for run, f in zip(folded.runs, folded.fold_of, strict=True) if f == fold]
         for fold in range(len(folded.models))
@@ -34,6 +33,12 @@ def main() -> int:
     print(f"new ground named after, median: {changes.median_s:.1f} s")
     print(f"never named: {changes.never:.0%}")
     return 0
+
+
+def labelled_runs() -> list[LabelledRun]:
+    """The runs of BorealTC that have an IMU."""
+    names = [name for name in catalogued() if name.startswith("borealtc/")]
+    return open_runs([name for name in names if has_imu(name)])
 
 
 def has_imu(name: str) -> bool:

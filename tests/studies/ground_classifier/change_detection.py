@@ -1,11 +1,15 @@
 """Delay of detecting changes of ground, on routes spliced from the signals of held-out runs."""
 
+from __future__ import annotations
+
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.training.detector_scores import drawn_patches
 from terrafusion.fusion.training.softmax import SoftmaxModel
 from terrafusion.fusion.training.surface_features import (
     HOP_S,
@@ -49,19 +53,15 @@ def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, li
     `MIN_RUN_S`.
     """
     rng = np.random.default_rng([seed, 23])
-    grounds = sorted({label for _, label in runs})
     parts: list[tuple[float, Signals]] = []
     begins: list[tuple[float, str]] = []
-    at, last = 0.0, ""
-    for _ in range(PATCHES):
-        label = str(rng.choice([g for g in grounds if g != last]))
-        choices = [s for s, g in runs if g == label]
-        source = choices[int(rng.integers(len(choices)))]
+    at = 0.0
+    for label, source in itertools.islice(drawn_patches(runs, rng), PATCHES):
         length = min(float(rng.uniform(*PATCH_S)), source.end_s() - 0.5)
         begin = float(rng.uniform(0.0, source.end_s() - length))
         parts.append((at - begin, source.between(begin, begin + length)))
         begins.append((at, label))
-        at, last = at + length, label
+        at += length
     return _joined(parts), begins
 
 
