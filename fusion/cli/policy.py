@@ -37,7 +37,7 @@ def fit(
 
     Args:
         ground (SOIL): Soil to drive on; repeat for more. By default the four of the detector.
-        vehicle: Simulated vehicle of the library (elevate), and the vehicle of logs that name none.
+        vehicle: Simulated vehicle of the library (elevate), and the vehicle of the logs, instead of theirs.
     """
     import dataclasses
 

@@ -59,7 +59,7 @@ class MeasuredMotion:
 
 
 def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
-    """Samples of logs: files, folders, or names of the catalogue; `vehicle` for those that name none.
+    """Samples of logs: files, folders, or names of the catalogue; `vehicle` instead of theirs.
 
     Raises:
         DataError: a log lacks wheels, truth or labels, or moves too little on a ground.
@@ -152,7 +152,7 @@ def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotio
     )
     if len(wheels) < 2 or len(truth) < 2:
         raise DataError(f"{recording.name}: wheels or truth hold no two samples", channel="truth")
-    rig = choose_vehicle(recording, recording.vehicle or vehicle)[0].rig()
+    rig = choose_vehicle(recording, vehicle)[0].rig()
     first, last = max(wheels.t_ns[0], truth.t_ns[0]), min(wheels.t_ns[-1], truth.t_ns[-1])
     middle = np.arange(first + _HALF_NS, last - _HALF_NS, round(SLIP_S * 1e9), dtype=np.int64)
     left, right = _means(

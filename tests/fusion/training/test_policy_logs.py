@@ -89,6 +89,16 @@ def test_poses_of_the_twin_tell_what_its_true_velocity_tells() -> None:
             assert np.std(found.side_slip) < 2.0 * np.std(known.side_slip) + 0.01
 
 
+def test_the_vehicle_asked_for_comes_before_that_of_the_log() -> None:
+    unknown = dataclasses.replace(circled(), vehicle="prototype_7")
+    by_its_name, asked = motion_of(circled()), motion_of(unknown, "warthog")
+    assert np.array_equal(asked.wheel_radps, by_its_name.wheel_radps)
+    other = motion_of(circled(), "husky")
+    assert other.wheel_radps == pytest.approx(
+        by_its_name.wheel_radps * TRACK_M / load_vehicle("husky").rig().track_m
+    )
+
+
 def test_a_mean_over_two_grounds_is_of_neither() -> None:
     labels = Terrain(nanoseconds(np.array([0.0, 15.0])), np.array(["grass", "gravel"]))
     found = logged_samples(dataclasses.replace(circled(), terrain=labels))
