@@ -18,6 +18,7 @@ from terrafusion.fusion.cli.common import (
     refuse_no_yaml,
 )
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.usage import refuse_options
 
 if TYPE_CHECKING:
     from terrafusion.twin.calibrate.coordinates import Prior
@@ -36,6 +37,8 @@ OUTPUT = Output(
     ("config.json", "calibration.json", "vehicle.yaml", "soil*.yaml", "report.html"),
     ("calibration.json",),
 )
+INPUT, WINDOW_S = "auto", 10.0
+"""Defaults of options."""
 SENSORS_OUTPUT = Output("A vehicle file.", suffix=".yaml", mark="known: calibrated")
 
 
@@ -49,11 +52,11 @@ def calibrate(
     prior: list[str] | None = None,
     source: Annotated[
         str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
-    ] = "auto",
+    ] = INPUT,
     truth: bool = False,
     robust: bool = False,
     channels: str | None = None,
-    window_s: float = 10.0,
+    window_s: float = WINDOW_S,
     slope_deg: float = 0.0,
     aspect_deg: float = 0.0,
     payload_kg: float = 0.0,
@@ -87,8 +90,15 @@ def calibrate(
         suggest: Suggest manoeuvres that would identify the unresolved parameters.
     """
     if sensors:
-        of_the_twin = (terrain, parameters, prior, suggest, truth, channels, robust)
-        return _sensors(logs, vehicle, how, out, any(of_the_twin))
+        of_the_twin = {
+            "--terrain": bool(terrain), "--parameters": parameters is not None, "--prior": bool(prior),
+            "--input": source != INPUT, "--truth": truth, "--robust": robust,
+            "--channels": channels is not None, "--window-s": window_s != WINDOW_S,
+            "--slope-deg": slope_deg != 0.0, "--aspect-deg": aspect_deg != 0.0,
+            "--payload-kg": payload_kg != 0.0, "--suggest": suggest,
+        }  # fmt: skip
+        refuse_options(of_the_twin, "does not go with --sensors")
+        return _sensors(logs, vehicle, how, out)
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
@@ -126,15 +136,13 @@ def _shown(found: Calibration, vehicle: str, out: Path, suggest: bool) -> Result
     return Result(lines, f"written to {out}", document, vehicle=load_vehicle(vehicle))
 
 
-def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path, of_the_twin: bool) -> Result:
-    """Learn the sensor numbers of a robot, and write its file; options of the twin are wrong usage."""
+def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path) -> Result:
+    """Learn the sensor numbers of a robot, and write its file."""
     import dataclasses
 
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors
 
-    if of_the_twin:
-        raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
     refuse_no_yaml(out)
     recordings = how.open_all(logs, load_rig(vehicle))
     for recording in recordings:

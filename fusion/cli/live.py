@@ -18,6 +18,7 @@ from terrafusion.fusion.cli.common import (
     load_rig,
     parse_topics,
 )
+from terrafusion.fusion.cli.usage import refuse_options
 
 if TYPE_CHECKING:
     from terrafusion.fusion.estimate.estimate import State
@@ -82,9 +83,17 @@ def live(
         vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=_datum(datum),
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
     )  # fmt: skip
+    of_a_robot = {
+        "--domain": domain is not None, "--loopback": loopback, "--reliable": reliable,
+        "--seconds": seconds is not None, "--foxglove": foxglove is not None,
+        "--rate": rate != LiveOptions.frequency, "--wait": wait != LiveOptions.wait_s,
+        "--datum": datum is not None, "--use-sim-time": use_sim_time, "--namespace": namespace != "",
+    }  # fmt: skip
     if log is not None:
+        refuse_options(of_a_robot, "goes with a robot, not with a LOG")
         _run_log(log, options, realtime)
     else:
+        refuse_options({"--realtime": realtime}, "goes with a LOG")
         _run_robot(options, _domain(domain), loopback, reliable, seconds, foxglove)
     return Result()
 

@@ -1,7 +1,7 @@
 """Wrong usage of the command line, as one line with the nearest match."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import typer
@@ -35,6 +35,17 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """`; did you mean ...?` with the known word most like `word`; empty where none is like it."""
     found = difflib.get_close_matches(word, list(known), 1, 0.5)
     return f"; did you mean {found[0]}?" if found else ""
+
+
+def refuse_options(given: Mapping[str, bool], why: str) -> None:
+    """Options that would have no effect are wrong usage (exit status 2).
+
+    Args:
+        given: whether it was given, by option.
+    """
+    for option, is_given in given.items():
+        if is_given:
+            raise typer.BadParameter(why, param_hint=option)
 
 
 def usage_line(error: Any) -> str:

@@ -39,6 +39,11 @@ def test_errors_are_one_line(terrafusion, good_log: Path, tmp_path: Path) -> Non
         assert done.status == 1, words
         assert told in done.err
         assert done.err.count("\n") == 1
-    mixed = terrafusion("calibrate", good_log, "--sensors", "--parameters", "soil.x", "--out", out)
-    assert mixed.status == 2
+    for option, value in (
+        ("--parameters", "soil.x"), ("--input", "wheels"), ("--window-s", 5), ("--slope-deg", 3),
+        ("--aspect-deg", 90), ("--payload-kg", 10),
+    ):  # fmt: skip
+        mixed = terrafusion("calibrate", good_log, "--sensors", option, value, "--out", out)
+        assert mixed.status == 2, option
+        assert f"{option}: does not go with --sensors" in mixed.err
     assert not out.exists()

@@ -47,6 +47,25 @@ def test_options_that_make_no_sense_are_refused_with_a_log_too(
     assert isinstance(CliRunner().invoke(app, ["live", str(good_log), *words]).exception, TerrafusionError)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--domain", "7"), ("--loopback",), ("--reliable",), ("--seconds", "3"), ("--foxglove", "8765"),
+        ("--rate", "20"), ("--wait", "0.1"), ("--datum", "1,2,3"), ("--use-sim-time",), ("--namespace", "/r"),
+    ],
+)  # fmt: skip
+def test_options_of_a_robot_are_wrong_usage_beside_a_log(good_log: Path, words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(app, ["live", str(good_log), *words])
+    assert done.exit_code == 2
+    assert f"{words[0]}: goes with a robot, not with a LOG" in " ".join(done.output.split())
+
+
+def test_the_pace_of_a_recording_is_wrong_usage_without_one() -> None:
+    done = CliRunner().invoke(app, ["live", "--realtime", "--seconds", "0"])
+    assert done.exit_code == 2
+    assert "--realtime: goes with a LOG" in " ".join(done.output.split())
+
+
 def test_a_log_that_is_not_there_is_a_known_error() -> None:
     done = CliRunner().invoke(app, ["live", "no-such-log"])
     assert isinstance(done.exception, TerrafusionError)
