@@ -155,7 +155,7 @@ class Sourced(Quantity):
                 what = f"'{{key}}' has the unknown entry '{shown(name)}'{why}"
                 raise RejectedError(what, "keep 'value', 'source' and 'valid' only")
         if not isinstance(raw.get("source"), str) or not raw["source"].strip():
-            raise RejectedError("'{key}' has no source", "tell where the number comes from")
+            raise RejectedError("'{key}' has no source", "add source: data sheet, measurement or assumed")
         value = super().parse(raw.get("value"))
         if "valid" in raw:
             self._check_valid(value, raw["valid"])

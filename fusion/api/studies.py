@@ -72,10 +72,9 @@ def benchmark(
         ConfigError: an unknown family.
         TerrafusionError: nothing to run, workers died, or the folder cannot be written.
     """
-    import dataclasses
-
     import pandas as pd
 
+    from terrafusion.fusion.benchmark.compare import as_json
     from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import at_the_end, origin_of, write_benchmark
@@ -84,4 +83,4 @@ def benchmark(
     origin = origin_of(plan, "terrafusion.benchmark")
     result = run_benchmark(plan, Path(out), jobs=jobs, backend=backend, address=address, progress=progress)
     write_benchmark(Path(out), result, at_the_end(origin))
-    return pd.json_normalize([dataclasses.asdict(row) for row in result.rows])
+    return pd.json_normalize([as_json(row) for row in result.rows])

@@ -5,12 +5,14 @@ The errors of two methods are divided run by run; the result is the median ratio
 ordered ratios (Thompson 1936, Ann. Math. Statist. 7(3)): distribution-free, from `LEAST_UNITS` units on. The
 interval of a share of two gains is the percentile bootstrap's over units, both methods resampled together.
 
-A failed replay has an infinite error. Runs on which the base failed are left out.
+A failed replay has an infinite error. Runs on which the baseline failed are left out.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,24 +39,33 @@ class Contrast:
     """One method against another in one family on one plant.
 
     Attributes:
-        arm, base: names of the two methods.
+        method, baseline: names of the two methods.
         units: independent runs (or logs) in which both have an error.
-        error_m, base_m: median errors; infinite if half of the replays failed.
-        ratio, interval: median of the paired ratios, error over base; no interval below `LEAST_UNITS`.
+        error_m, baseline_m: median errors; infinite if half of the replays failed.
+        ratio, interval: median of the paired ratios, error over baseline; none below `LEAST_UNITS`.
         wins, losses: units whose ratio is below or above 1 by more than `EVEN`.
     """
 
     family: str
     plant: str
-    arm: str
-    base: str
+    method: str
+    baseline: str
     units: int
     error_m: float
-    base_m: float
+    baseline_m: float
     ratio: float
     interval: Interval | None
     wins: int
     losses: int
+
+
+JSON_KEYS = {"method": "arm", "baseline": "base", "baseline_m": "base_m"}
+"""Keys of benchmark.json that are not the names of their fields."""
+
+
+def as_json(score: RunScore | Contrast) -> dict[str, Any]:
+    """A score or contrast as in benchmark.json."""
+    return {JSON_KEYS.get(key, key): value for key, value in dataclasses.asdict(score).items()}
 
 
 @dataclass(frozen=True)
@@ -75,15 +86,15 @@ def groups_of(rows: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]
     return groups
 
 
-def contrasts(rows: Sequence[RunScore], base: str = BASELINE) -> list[Contrast]:
-    """Every method against `base`, group by group."""
+def contrasts(rows: Sequence[RunScore], baseline: str = BASELINE) -> list[Contrast]:
+    """Every method against `baseline`, group by group."""
     out = []
     for (family, plant), group in groups_of(rows).items():
         errors = errors_by_unit(group)
-        for arm in dict.fromkeys(row.arm for row in group):
-            found = _contrast(errors, arm, base)
+        for method in dict.fromkeys(row.method for row in group):
+            found = _contrast(errors, method, baseline)
             if found is not None:
-                out.append(Contrast(family, plant, arm, base, *found))
+                out.append(Contrast(family, plant, method, baseline, *found))
     return out
 
 
@@ -99,16 +110,18 @@ def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, fl
         broken = row.failed or (row.diverged and row.error_m is None)
         error = math.inf if broken else row.error_m
         if error is not None:
-            by_unit = out.setdefault(row.arm, {}).setdefault(row.unit, {})
+            by_unit = out.setdefault(row.method, {}).setdefault(row.unit, {})
             by_unit[row.drive] = max(error, LEAST_ERROR_M)
     return out
 
 
-def log_ratios(errors: dict[str, dict[str, dict[str, float]]], arm: str, base: str) -> dict[str, float]:
-    """Unit -> logarithm of the ratio: median over the common runs in which the base did not fail."""
+def log_ratios(
+    errors: dict[str, dict[str, dict[str, float]]], method: str, baseline: str
+) -> dict[str, float]:
+    """Unit -> logarithm of the ratio: median over the common runs in which the baseline did not fail."""
     out = {}
-    for unit, own in errors.get(arm, {}).items():
-        other = errors.get(base, {}).get(unit, {})
+    for unit, own in errors.get(method, {}).items():
+        other = errors.get(baseline, {}).get(unit, {})
         logs = [
             math.log(error / other[drive])
             for drive, error in own.items()
@@ -149,12 +162,12 @@ def _sign_test_rank(n: int) -> int:
 
 
 def _contrast(
-    errors: dict[str, dict[str, dict[str, float]]], arm: str, base: str
+    errors: dict[str, dict[str, dict[str, float]]], method: str, baseline: str
 ) -> tuple[int, float, float, float, Interval | None, int, int] | None:
-    logs = log_ratios(errors, arm, base)
+    logs = log_ratios(errors, method, baseline)
     if not logs:
         return None
-    own, other = ([float(np.median([*errors[a][u].values()])) for u in logs] for a in (arm, base))
+    own, other = ([float(np.median([*errors[a][u].values()])) for u in logs] for a in (method, baseline))
     middle, interval = median_interval(list(logs.values()))
     ratios = np.exp(list(logs.values()))
     return (
@@ -165,7 +178,7 @@ def _contrast(
 
 
 def _share(errors: dict[str, dict[str, dict[str, float]]]) -> tuple[float | None, Interval | None]:
-    own, best = (log_ratios(errors, arm, BASELINE) for arm in (ADAPTIVE, ORACLE))
+    own, best = (log_ratios(errors, method, BASELINE) for method in (ADAPTIVE, ORACLE))
     units = [unit for unit in own if unit in best]
     if not units:
         return None, None

@@ -44,7 +44,7 @@ class Compared:
         corrected: the same with the named effect; None where none was named.
     """
 
-    mark: str
+    score: str
     references: float | None
     runs: float | None
     twin: float | None

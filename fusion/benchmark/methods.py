@@ -85,7 +85,7 @@ def replay_options(method: Method, labels: GroundLabels | None, seed: int) -> di
     given = {
         "true": labels,
         "shuffled": shuffled(labels, policy, seed),
-        "adversarial": misleading(labels, policy),
+        "adversarial": wrong_labels(labels, policy),
     }
     return {"mode": method.mode, "settings": {"labels": given[method.labels]}}
 
@@ -118,13 +118,13 @@ def shuffled(labels: GroundLabels, policy: Policy, seed: int, seconds: float = 3
     return GroundLabels(times, tuple(known[i] for i in drawn))
 
 
-def misleading(labels: GroundLabels, policy: Policy) -> GroundLabels:
-    """Each ground labelled as the class `most_foreign` to it."""
-    worst = {name: most_foreign(name, policy) for name in set(labels.names)}
+def wrong_labels(labels: GroundLabels, policy: Policy) -> GroundLabels:
+    """Each ground labelled as the class `most_different_class` to it."""
+    worst = {name: most_different_class(name, policy) for name in set(labels.names)}
     return GroundLabels(labels.t_ns, tuple(worst[name] for name in labels.names))
 
 
-def most_foreign(name: str, policy: Policy) -> str:
+def most_different_class(name: str, policy: Policy) -> str:
     """The class whose slip has the largest divergence from that of `name`; "unknown" for an unknown ground.
 
     Kullback-Leibler divergence of the true slip from the class's, both Gaussian (Kullback and Leibler 1951).

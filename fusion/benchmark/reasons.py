@@ -54,9 +54,9 @@ def reasons(rows: Sequence[RunScore]) -> list[Reason]:
     for (family, plant), group in groups_of(rows).items():
         lost = [
             c
-            for base in BASELINES
-            for c in contrasts(group, base)
-            if c.arm == ADAPTIVE and c.ratio > 1.0 + EVEN
+            for baseline in BASELINES
+            for c in contrasts(group, baseline)
+            if c.method == ADAPTIVE and c.ratio > 1.0 + EVEN
         ]
         if lost:
             worst = max(lost, key=lambda c: c.ratio)
@@ -65,12 +65,12 @@ def reasons(rows: Sequence[RunScore]) -> list[Reason]:
 
 
 def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore]) -> Reason:
-    oracle = [c.ratio for c in contrasts(group, worst.base) if c.arm == ORACLE]
-    ground, kind = _where(group, worst.base)
+    oracle = [c.ratio for c in contrasts(group, worst.baseline) if c.method == ORACLE]
+    ground, kind = _where(group, worst.baseline)
     return Reason(
         family,
         plant,
-        worst.base,
+        worst.baseline,
         worst.ratio,
         worst.interval is not None and worst.interval[0] > 1.0,
         oracle[0] if oracle else None,
@@ -85,7 +85,7 @@ def recognised(rows: Sequence[RunScore], ground: str = "") -> float | None:
     total = right = 0.0
     for row in rows:
         for g in row.grounds:
-            if row.arm == ADAPTIVE and g.recognised is not None and ground in ("", g.ground):
+            if row.method == ADAPTIVE and g.recognised is not None and ground in ("", g.ground):
                 total, right = total + g.seconds, right + g.seconds * g.recognised
     return right / total if total > 0.0 else None
 
@@ -94,7 +94,7 @@ def _where(rows: Sequence[RunScore], winner: str) -> tuple[str, str]:
     """Ground and kind of error with the largest excess of the adaptive method over the winner."""
     excess: dict[tuple[str, str], float] = defaultdict(float)
     for row in rows:
-        sign = {ADAPTIVE: 1.0, winner: -1.0}.get(row.arm, 0.0)
+        sign = {ADAPTIVE: 1.0, winner: -1.0}.get(row.method, 0.0)
         for g in row.grounds:
             for kind, words in KINDS.items():
                 error = getattr(g, kind)

@@ -66,7 +66,7 @@ class RunScore:
     plant: str
     unit: str
     drive: str
-    arm: str
+    method: str
     outage_s: float | None = None
     distance_m: float | None = None
     error_m: float | None = None

@@ -137,10 +137,10 @@ def _estimator_gap(
     return estimator_gap(found, runs, references, estimator_scorer(vehicle), seed)
 
 
-def _line(score: Compared) -> str:
+def _line(compared: Compared) -> str:
     values = {
-        "references": score.references, "runs": score.runs, "their twin": score.twin,
-        "twin with the effect": score.corrected,
+        "references": compared.references, "runs": compared.runs, "their twin": compared.twin,
+        "twin with the effect": compared.corrected,
     }  # fmt: skip
     listed = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
-    return f"{score.mark}: {', '.join(listed)}"
+    return f"{compared.score}: {', '.join(listed)}"

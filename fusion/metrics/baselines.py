@@ -101,7 +101,7 @@ def baselines(
     reckoned = receiver = None
     if path is not None:
         point = lever if against_antenna else 0j
-        reckoned = _laid_onto(path, known, errors, point, aligned)
+        reckoned = _aligned_with(known, path, errors, point, aligned)
     fixes = _valid(used)
     if fixes is not None:
         receiver = _receiver_error_m(fixes, errors, 0j if against_antenna else lever)
@@ -149,8 +149,10 @@ def dead_reckoning(recording: Recording, wheel_radius_m: float, track_m: float) 
     return ReckonedPath(t_ns, np.concatenate([[0j], np.cumsum(steps)]), yaw)
 
 
-def _laid_onto(path: ReckonedPath, known: Estimate, errors: Errors, point: complex, aligned: bool) -> Array:
-    """Errors (M,) of the dead-reckoned path, laid onto the start of the estimate."""
+def _aligned_with(
+    known: Estimate, path: ReckonedPath, errors: Errors, point: complex, aligned: bool
+) -> Array:
+    """Errors (M,) of the dead-reckoned path, aligned with the start of the estimate."""
     keys = known.trajectory
     z, yaw = path.at(keys.t_ns)
     rolled = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(z)))])

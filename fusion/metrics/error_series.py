@@ -276,8 +276,12 @@ def _interpolate(t_ns: TimesNs, grid_ns: TimesNs, values: Array) -> Array:
 def align_both(
     truth: Errors | None, fixes: Errors | None
 ) -> tuple[Errors | None, Errors | None, tuple[str, ...]]:
+    """Align the start of the path with truth and fixes, each by itself (`align_start`); also notes on how.
+
+    Errors that are None or hold no known distance come back as they are, without a note.
+    """
     out, notes = [], []
-    for errors, name in ((truth, "truth"), (fixes, "fixes kept back")):
+    for errors, name in ((truth, "truth"), (fixes, "held-out fixes")):
         if errors is None or not np.isfinite(errors.distance_m()).any():
             out.append(errors)
             continue

@@ -20,7 +20,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.json_text import to_json
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.benchmark.checkpoints import LIBRARIES, hash_sources, sources_sha256
-from terrafusion.fusion.benchmark.compare import LEAST_UNITS, Contrast, contrasts, shares
+from terrafusion.fusion.benchmark.compare import LEAST_UNITS, Contrast, as_json, contrasts, shares
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE
 from terrafusion.fusion.benchmark.plan import BenchmarkPlan
 from terrafusion.fusion.benchmark.reasons import reasons
@@ -42,8 +42,8 @@ CAPTION = (
     "pairs and its 95 % interval. The filled dot is the adaptive weighting with the detected terrain."
 )
 COLOURS = style.MODE_COLOURS | {"data sheet": "#e69f00", "shuffled": "#8c510a", "adversarial": "#5e2a84"}
-ARM_PX, LEAST_PX = 15, 48
-"""Height of an arm in the row of its group, and of the row at least."""
+METHOD_PX, LEAST_PX = 15, 48
+"""Height of a method in the row of its group, and of the row at least."""
 RANGE = (0.1, 20.0)
 """Of the ratios; what lies outside, such as those of failed replays, is drawn at its ends."""
 TICKS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
@@ -164,15 +164,13 @@ def _content(result: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, An
     return {
         "schema": SCHEMA,
         "origin": dict(origin),
-        "contrasts": [
-            dataclasses.asdict(c) for base in ("fixed", "innovation") for c in contrasts(rows, base)
-        ],
+        "contrasts": [as_json(c) for baseline in ("fixed", "innovation") for c in contrasts(rows, baseline)],
         "shares": [dataclasses.asdict(s) for s in shares(rows)],
         "targets": [dataclasses.asdict(t) | {"verdict": t.verdict()} for t in targets(rows)],
         "reasons": [dataclasses.asdict(r) | {"blame": r.blame()} for r in reasons(rows)],
         "consistency": [_cell(c) for c in pooled_nees(rows)],
         "refused": [dataclasses.asdict(one) for one in result.refused],
-        "rows": [dataclasses.asdict(row) for row in rows],
+        "rows": [as_json(row) for row in rows],
     }
 
 
@@ -184,14 +182,14 @@ def _cell(cell: PooledConsistency) -> dict[str, Any]:
 
 
 def plot_ratios(sheet: Sheet, contrasts: Sequence[Contrast]) -> None:
-    """A row a family and plant, in it each arm with its 95 % interval; below 1 its errors are smaller."""
-    shown = [c for c in contrasts if c.arm != BASELINE]
+    """A row a family and plant, in it each method with its 95 % interval; below 1 its errors are smaller."""
+    shown = [c for c in contrasts if c.method != BASELINE]
     groups = list(dict.fromkeys((c.family, c.plant) for c in shown))
-    arms = list(dict.fromkeys(c.arm for c in shown))
+    methods = list(dict.fromkeys(c.method for c in shown))
     if not shown:
         return
     names = [f"{family}, {plant}" for family, plant in groups]
-    px = max(LEAST_PX, ARM_PX * (len(arms) + 2))
+    px = max(LEAST_PX, METHOD_PX * (len(methods) + 2))
     x = f"position error over that of {BASELINE}"
     ends = [_clipped(x) for c in shown for x in (c.ratio, *(c.interval or ()))]
     limits = (0.9 * min(ends), 1.1 * max(ends))
@@ -199,15 +197,15 @@ def plot_ratios(sheet: Sheet, contrasts: Sequence[Contrast]) -> None:
     plot.panel.figure.xaxis.ticker = [t for t in TICKS if limits[0] <= t <= limits[1]]
     edge = np.array([-0.5, len(groups) - 0.5])
     plot.line(np.ones(2), edge, "as large as that of fixed", style.TRUTH_ON_ANY, width=1.0)
-    for k, arm in enumerate(arms):
-        own = [c for c in shown if c.arm == arm]
-        offset = (k - 0.5 * (len(arms) - 1)) / (len(arms) + 2)
+    for k, method in enumerate(methods):
+        own = [c for c in shown if c.method == method]
+        offset = (k - 0.5 * (len(methods) - 1)) / (len(methods) + 2)
         rows = np.array([groups.index((c.family, c.plant)) + offset for c in own])
         values = [(c.ratio, *(c.interval or (c.ratio, c.ratio))) for c in own]
         text = [f"{v:.3g} [{a:.3g}, {b:.3g}]" for v, a, b in values]
         ratio, low, high = (np.array([_clipped(row[i]) for row in values]) for i in range(3))
-        colour = style.line_colour(style.colour_of(arm, COLOURS))
-        plot.intervals(rows, ratio, low, high, arm, colour, hollow=arm != ADAPTIVE, text=text)
+        colour = style.line_colour(style.colour_of(method, COLOURS))
+        plot.intervals(rows, ratio, low, high, method, colour, hollow=method != ADAPTIVE, text=text)
 
 
 def _clipped(ratio: float) -> float:

@@ -24,7 +24,7 @@ from terrafusion.fusion.metrics.pooled_consistency import VERDICT_SIGNS, PooledC
 
 Cells = list[str]
 NOT_SIGNIFICANT = " (not significant)"
-WORDS = ("what", "verdict", "beaten by", "cause", "largest loss", "plant, arm", "arm", "why", "is")
+WORDS = ("what", "verdict", "beaten by", "cause", "largest loss", "plant, method", "method", "why", "is")
 """Heads of columns of words; the first column is one, too."""
 
 
@@ -63,21 +63,21 @@ def group_name(family: str, plant: str) -> str:
 def _main(rows: Sequence[RunScore]) -> Section:
     """Median error of the fixed noise, and the ratios to it."""
     results = contrasts(rows)
-    arms = [arm.name for arm in METHODS if arm.name != BASELINE]
+    methods = [method.name for method in METHODS if method.name != BASELINE]
     lines = []
     for family, plant in groups_of(rows):
-        of = {c.arm: c for c in results if (c.family, c.plant) == (family, plant)}
+        of = {c.method: c for c in results if (c.family, c.plant) == (family, plant)}
         if BASELINE in of:
             units = of[BASELINE].units
             head = [group_name(family, plant), str(units), number(of[BASELINE].error_m)]
-            lines.append([*head, *(_ratio(of.get(arm), units) for arm in arms)])
+            lines.append([*head, *(_ratio(of.get(method), units) for method in methods)])
     about = (
         f"Root mean square position error inside the outage: its median for {BASELINE} (tuned), and for the "
         f"others the median of the paired ratios to it, with its 95 % interval from {LEAST_UNITS} pairs on. "
         "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
         "every drive has labels."
     )
-    return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *arms), tuple(lines))
+    return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *methods), tuple(lines))
 
 
 def _targets(results: Iterable[Target]) -> Section:
@@ -91,8 +91,9 @@ def _targets(results: Iterable[Target]) -> Section:
     ]  # fmt: skip
     about = (
         "Reached or missed: the whole interval is on one side of the limit. Open: it contains the limit, or "
-        f"there is none (below {LEAST_UNITS} drives). G9 is missed by any replay of {ADAPTIVE} that fails or "
-        "diverges; its logs were in view while the estimator was developed."
+        f"there is none (below {LEAST_UNITS} drives). G1: {ADAPTIVE} on mixed ground; G2: harm by wrong "
+        "labels, or on firm ground; G5: drift in long outages; G9: field logs, missed by any replay of "
+        f"{ADAPTIVE} that fails or diverges; they were in view while the estimator was developed."
     )
     return Section("Targets", about, ("target", "what", "limit", "measured", "verdict"), tuple(lines))
 
@@ -115,16 +116,16 @@ def _reasons(results: Iterable[Reason]) -> Section:
 
 
 def _wins(results: Iterable[Contrast]) -> Section:
-    arms = [arm.name for arm in METHODS if arm.name != BASELINE]
+    methods = [method.name for method in METHODS if method.name != BASELINE]
     groups: dict[tuple[str, str], dict[str, Contrast]] = {}
     for c in results:
-        groups.setdefault((c.family, c.plant), {})[c.arm] = c
+        groups.setdefault((c.family, c.plant), {})[c.method] = c
     lines = [
-        [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in arms)]
+        [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in methods)]
         for key, of in groups.items()
     ]
     about = f"Drives (logs in the field) won and lost against {BASELINE} by more than 3 %."
-    return Section("Wins and losses", about, ("drives", *arms), tuple(lines))
+    return Section("Wins and losses", about, ("drives", *methods), tuple(lines))
 
 
 def _shares(rows: Sequence[RunScore]) -> Section:
@@ -133,7 +134,7 @@ def _shares(rows: Sequence[RunScore]) -> Section:
     for s in shares(rows):
         known = recognised(groups[s.family, s.plant])
         delays = [
-            r.switch_s for r in groups[s.family, s.plant] if r.arm == ADAPTIVE and r.switch_s is not None
+            r.switch_s for r in groups[s.family, s.plant] if r.method == ADAPTIVE and r.switch_s is not None
         ]
         if s.share is not None or known is not None:
             share = "no gain" if s.share is None else f"{number(s.share)}{_ends(s.interval)}"
@@ -162,7 +163,7 @@ def _nees(cells: Iterable[PooledConsistency]) -> Section:
         "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator; with fewer "
         f"than {LEAST_UNITS} drives the mean alone."
     )
-    heads = ("terrain", "plant, arm", "drives", INSIDE, IN_OUTAGE)
+    heads = ("terrain", "plant, method", "drives", INSIDE, IN_OUTAGE)
     return Section("Consistency", about, heads, tuple(lines))
 
 
@@ -172,22 +173,22 @@ def _field(rows: Sequence[RunScore]) -> Section:
     lines = []
     for log in dict.fromkeys(row.unit for row in own):
         of = {
-            arm.name: [row.error_m for row in own if (row.unit, row.arm) == (log, arm.name)]
-            for arm in METHODS
+            method.name: [row.error_m for row in own if (row.unit, row.method) == (log, method.name)]
+            for method in METHODS
         }
-        lines.append([log, str(len(of[BASELINE])), *(_median(of[arm.name]) for arm in METHODS)])
+        lines.append([log, str(len(of[BASELINE])), *(_median(of[method.name]) for method in METHODS)])
     about = "Median over the outages of a log, m; against truth, or held-out fixes with their noise."
-    return Section("Field logs", about, ("log", "drives", *(arm.name for arm in METHODS)), tuple(lines))
+    return Section("Field logs", about, ("log", "drives", *(method.name for method in METHODS)), tuple(lines))
 
 
 def _failures(rows: Sequence[RunScore]) -> Section:
     results = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
-    lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in results)
-    return Section("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
+    lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.method, why] for row, why in results)
+    return Section("Replays that failed or diverged", "All of them.", ("drive", "method", "why"), lines)
 
 
 def _arms() -> Section:
-    lines = [[arm.name, arm.about] for arm in METHODS]
+    lines = [[method.name, method.about] for method in METHODS]
     lines += [[name, family.about] for name, family in FAMILIES.items()]
     lines += [[FIELD, "field logs at hand, 30, 60 and 120 s without GNSS; by terrain"]]
     lines += [[name, about] for name, about in PLANTS.items()]

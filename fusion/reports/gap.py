@@ -6,7 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from terrafusion.fusion.benchmark.estimator_gap import Compared
-from terrafusion.fusion.reports.gap_text import either, named_sets, numbers, percent, sections, verdict_line
+from terrafusion.fusion.reports.gap_text import (
+    alternatives_text,
+    named_sets,
+    numbers,
+    percent,
+    sections,
+    verdict_line,
+)
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
 from terrafusion.fusion.reports.plots.sheet import Sheet
@@ -37,7 +44,8 @@ def write_diagnosis(
     scores, failed = judged or ((), ())
     write_text(out / "diagnosis.json", json.dumps(d.to_json(), indent=1, allow_nan=False) + "\n")
     if judged is not None:
-        rows = [dataclasses.asdict(score) for score in scores]
+        keys = ("mark", "references", "runs", "twin", "corrected")
+        rows = [dict(zip(keys, dataclasses.astuple(one), strict=True)) for one in scores]
         write_text(out / "judge.json", json.dumps(rows, indent=1, allow_nan=False) + "\n")
     sheet = Sheet()
     paths = plots.plot_paths(sheet, d, MOST_RUNS) if d.detected else []
@@ -70,7 +78,7 @@ def _tiles(d: GapDiagnosis) -> list[Tile]:
     p, limit = d.detection.p_value, d.significance
     tiles = [Tile("p of no gap", f"{p:.2g}", f"a gap below {limit:g}")]
     if named := named_sets(d):
-        tiles.append(Tile("certain of the cause", percent(named[0].probability), either(named[0])))
+        tiles.append(Tile("certain of the cause", percent(named[0].probability), alternatives_text(named[0])))
     elif d.verdict.kind == "unknown":
         tiles.append(
             Tile("certain of an unknown cause", percent(d.verdict.p_unknown), "none of the catalogue")
@@ -102,7 +110,9 @@ def _causes(d: GapDiagnosis) -> list[list[str]]:
 
 
 def _sets(d: GapDiagnosis) -> list[list[str]]:
-    return [[either(s), percent(s.probability), "yes" if s.named else "no"] for s in d.verdict.sets]
+    return [
+        [alternatives_text(s), percent(s.probability), "yes" if s.named else "no"] for s in d.verdict.sets
+    ]
 
 
 def _drives(d: GapDiagnosis) -> list[str]:
@@ -114,6 +124,6 @@ def _drives(d: GapDiagnosis) -> list[str]:
 
 def _estimator_gap(scores: Sequence[Compared]) -> list[list[str]]:
     return [
-        [s.mark, *("" if v is None else f"{v:.3g}" for v in (s.references, s.runs, s.twin, s.corrected))]
+        [s.score, *("" if v is None else f"{v:.3g}" for v in (s.references, s.runs, s.twin, s.corrected))]
         for s in scores
     ]

@@ -81,9 +81,9 @@ def verdict_line(d: GapDiagnosis) -> str:
     if verdict.kind == "parameters":
         return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
     if len(sets) > 1:
-        both = "; and ".join(map(either, sets))
+        both = "; and ".join(map(alternatives_text, sets))
         return f"Gap caused by {len(sets)} effects together ({certain}): {both}."
-    return f"Gap caused by {either(sets[0], certain)}."
+    return f"Gap caused by {alternatives_text(sets[0], certain)}."
 
 
 def named_sets(d: GapDiagnosis) -> list[CredibleSet]:
@@ -145,7 +145,7 @@ def _test(d: GapDiagnosis) -> str:
     return f"p = {d.detection.p_value:.2g}, threshold {d.significance:g}"
 
 
-def either(s: CredibleSet, certain: str = "") -> str:
+def alternatives_text(s: CredibleSet, certain: str = "") -> str:
     """ "A, B or C, which these drives cannot tell apart"."""
     more = len(s.effects) - MOST_NAMES
     names = [*s.effects[:MOST_NAMES], *([f"{more} more"] if more > 0 else [])]

@@ -73,32 +73,34 @@ def fit_policy(
     for condition, recording in run_all(grid.conditions(), tick):
         drives[condition.terrain].append(samples_of(recording))
     grounds = {name: GroundSamples.joined(parts) for name, parts in drives.items()}
-    noise = {name: _noise_on(name, samples) for name, samples in grounds.items()}
+    by_ground = {name: _noise_on(name, samples) for name, samples in grounds.items()}
     fixed = noise_of(list(grounds.values()))
-    noise |= {
-        name: informed(noise.get(name, fixed), samples) for name, samples in sorted(logged.grounds.items())
+    by_ground |= {
+        name: informed(by_ground.get(name, fixed), samples)
+        for name, samples in sorted(logged.grounds.items())
     }
-    rows = {name: _rounded(row) for name, row in noise.items()}
-    matched = Policy(rows, fixed, "").blend(np.full(len(rows), 1.0 / len(rows)))
+    noise_by_class = {name: _rounded(noise) for name, noise in by_ground.items()}
+    equal = np.full(len(noise_by_class), 1.0 / len(noise_by_class))
+    matched = Policy(noise_by_class, fixed, "").blend(equal)
     return Policy(
-        classes={**rows, "unknown": _rounded(_spread(matched))},
+        classes={**noise_by_class, "unknown": _rounded(_spread(matched))},
         fixed=_rounded(matched if logged.grounds else fixed),
         inputs_sha256=fingerprint_of(grid, logged),
     )
 
 
-def informed(row: SensorNoise, logged: GroundSamples) -> SensorNoise:
+def informed(noise: SensorNoise, logged: GroundSamples) -> SensorNoise:
     """Noise of the twin updated by logs: means are replaced, standard deviations may only grow.
 
     Logs are few and their samples means over seconds. They give the slip over grade only if they are hilly.
     """
     hilly = len(logged.grade) > 0 and float(np.std(logged.grade)) > HILLY
-    level, slope = _slip_line([logged]) if hilly else (0.0, row.slip_per_grade)
+    level, slope = _slip_line([logged]) if hilly else (0.0, noise.slip_per_grade)
     level = level if hilly else float(np.median(logged.slip - slope * logged.grade))
     left = logged.slip - level - slope * logged.grade
     scatter = float(np.hypot(_rms([left]), RADIUS_SIGMA))
     slip = dataclasses.replace(
-        row, slip_mean=level, slip_per_grade=slope, slip_sigma=max(row.slip_sigma, scatter)
+        noise, slip_mean=level, slip_per_grade=slope, slip_sigma=max(noise.slip_sigma, scatter)
     )
     if not len(logged.yaw_scale):
         return slip  # without turns, yaw scale and side-slip stay the twin's
@@ -106,8 +108,8 @@ def informed(row: SensorNoise, logged: GroundSamples) -> SensorNoise:
     return dataclasses.replace(
         slip,
         yaw_scale_mean=scale,
-        yaw_scale_sigma=max(row.yaw_scale_sigma, scatter),
-        side_slip_sigma=max(row.side_slip_sigma, _rms([logged.side_slip])),
+        yaw_scale_sigma=max(noise.yaw_scale_sigma, scatter),
+        side_slip_sigma=max(noise.side_slip_sigma, _rms([logged.side_slip])),
     )
 
 

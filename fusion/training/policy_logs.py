@@ -71,13 +71,13 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
     parts: dict[str, list[GroundSamples]] = {}
     for log in logs:
         for recording in open_recordings(log):
-            for ground, evidence in logged_samples(recording, vehicle).items():
-                parts.setdefault(ground, []).append(evidence)
+            for ground, samples in logged_samples(recording, vehicle).items():
+                parts.setdefault(ground, []).append(samples)
     grounds = {name: GroundSamples.joined(found) for name, found in parts.items()}
-    for name, evidence in grounds.items():
-        if len(evidence.slip) < MIN_SLIPS:
+    for name, samples in grounds.items():
+        if len(samples.slip) < MIN_SLIPS:
             raise DataError(
-                f"the logs hold {len(evidence.slip)} slips on '{name}', {MIN_SLIPS} are needed",
+                f"the logs hold {len(samples.slip)} slips on '{name}', {MIN_SLIPS} are needed",
                 channel="terrain",
                 remedy="give longer drives on that ground, or leave its logs out",
             )

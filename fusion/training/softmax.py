@@ -32,7 +32,7 @@ from terrafusion.fusion.training.surface_features import (
 
 SCHEMA = "terrafusion.surface/2"
 PATCH_LENGTH_M = 10.0
-STRADDLES = round(WINDOW_S / HOP_S)
+WINDOWS_ACROSS_A_CHANGE = round(WINDOW_S / HOP_S)
 """Windows after a change that contain some of the ground before: for them only the last second is used."""
 STRENGTH = 0.1
 """Inverse of the L2 penalty on the weights of standardised features."""
@@ -125,13 +125,13 @@ class SoftmaxModel:
         log_p, recent = self.log_probabilities(windows.x), self.log_probabilities(windows.recent)
         patches = PatchFilter(len(self.classes), PATCH_LENGTH_M)
         p = np.empty_like(log_p)
-        age = STRADDLES
+        age = WINDOWS_ACROSS_A_CHANGE
         for i, (rolled, changed) in enumerate(zip(windows.rolled_m, self.changes(windows), strict=True)):
             patches.predict(float(rolled))
             if changed:
                 patches.forget(1.0)
             age = 0 if changed else age + 1
-            p[i] = patches.update(recent[i] if age < STRADDLES else log_p[i] / self.temperature)
+            p[i] = patches.update(recent[i] if age < WINDOWS_ACROSS_A_CHANGE else log_p[i] / self.temperature)
         return p
 
     def write(self, path: Path) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets.core.errors import ConfigError
 from tests.fusion.reports.browser import assert_drawn
 from tests.studies.__main__ import first
 from tests.studies.registry import STUDIES
@@ -21,7 +20,6 @@ from tests.studies.source_study import study as study_module
 from tests.studies.source_study.batch import BatchCell, slip_cells
 from tests.studies.source_study.claims import AGREE, NOT_EXAMINED, VERDICTS, load_claims
 from tests.studies.source_study.published import CASES, FRICTION
-from tests.studies.source_study.study import StudyPlan
 from tests.studies.source_study.text import COLUMNS
 
 DOCUMENT = Path(__file__).parents[1] / "studies" / "results" / "source_study.md"
@@ -149,8 +147,3 @@ def test_the_registry_reads_every_quoted_figure(reproduced: tuple[Path, str]) ->
         found = first(pattern, reproduced[1])
         assert found is not None, name
         assert found.count("|") == stored[name].count("|")
-
-
-def test_too_few_seeds_are_refused() -> None:
-    with pytest.raises(ConfigError, match="1 to 1000"):
-        StudyPlan(seeds=0).seed_count()

@@ -18,9 +18,9 @@ from terrafusion.fusion.reports.benchmark_tables import tables
 from terrafusion.fusion.reports.plots.sheet import Sheet
 
 
-def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[RunScore]:
+def rows(method: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[RunScore]:
     return [
-        RunScore(family, plant, f"seed {i}", f"seed {i}", arm, error_m=e, **fields)
+        RunScore(family, plant, f"seed {i}", f"seed {i}", method, error_m=e, **fields)
         for i, e in enumerate(errors)
     ]
 
@@ -37,7 +37,7 @@ def ground(name: str, forward: float, recognised: float = 0.5) -> GroundScore:
 def test_a_constant_ratio_is_found_whatever_the_drives(factor: float) -> None:
     base = spread(12)
     found = [
-        c for c in contrasts(rows("fixed", base) + rows("adaptive", factor * base)) if c.arm == "adaptive"
+        c for c in contrasts(rows("fixed", base) + rows("adaptive", factor * base)) if c.method == "adaptive"
     ]
     assert found[0].ratio == pytest.approx(factor)
     assert found[0].interval == pytest.approx((factor, factor))
@@ -47,8 +47,8 @@ def test_a_constant_ratio_is_found_whatever_the_drives(factor: float) -> None:
 def test_exchanging_two_arms_inverts_the_ratio_and_swaps_wins_and_losses() -> None:
     a, b = spread(), spread()[::-1]
     all_rows = rows("fixed", a) + rows("adaptive", b)
-    forth = next(c for c in contrasts(all_rows, "fixed") if c.arm == "adaptive")
-    back = next(c for c in contrasts(all_rows, "adaptive") if c.arm == "fixed")
+    forth = next(c for c in contrasts(all_rows, "fixed") if c.method == "adaptive")
+    back = next(c for c in contrasts(all_rows, "adaptive") if c.method == "fixed")
     assert forth.ratio == pytest.approx(1.0 / back.ratio)
     assert forth.wins + forth.losses <= 40
     assert abs(forth.wins - back.losses) <= 2  # within 3 % of even the two margins differ a little
@@ -58,7 +58,9 @@ def test_pairing_takes_the_spread_of_the_drives_out() -> None:
     base = spread()
     noise = np.exp(0.05 * np.random.default_rng(1).normal(size=40))
     found = next(
-        c for c in contrasts(rows("fixed", base) + rows("adaptive", 0.6 * base * noise)) if c.arm != "fixed"
+        c
+        for c in contrasts(rows("fixed", base) + rows("adaptive", 0.6 * base * noise))
+        if c.method != "fixed"
     )
     assert found.interval is not None
     assert found.interval[0] < 0.6 < found.interval[1]
@@ -69,7 +71,7 @@ def test_pairing_takes_the_spread_of_the_drives_out() -> None:
 def test_few_units_have_no_interval_and_decide_nothing(units: int) -> None:
     errors = np.linspace(0.4, 0.5, units)
     all_rows = rows("fixed", np.ones(units)) + rows("adaptive", errors) + rows("oracle", 0.9 * errors)
-    found = next(c for c in contrasts(all_rows) if c.arm == "adaptive")
+    found = next(c for c in contrasts(all_rows) if c.method == "adaptive")
     share = shares(all_rows)[0]
     assert (found.interval is None) == (share.interval is None) == (units < 6)
     verdict = next(t for t in targets(all_rows) if t.what == "mixed, twin: adaptive over fixed").verdict()
@@ -80,13 +82,13 @@ def test_few_units_have_no_interval_and_decide_nothing(units: int) -> None:
 
 
 def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -> None:
-    def failing(arm: str, unit: str) -> RunScore:
-        return RunScore("mixed", "twin", unit, unit, arm, failed="RuntimeError: singular")
+    def failing(method: str, unit: str) -> RunScore:
+        return RunScore("mixed", "twin", unit, unit, method, failed="RuntimeError: singular")
 
     base = [failing("fixed", f"seed {i}") for i in (0, 1)] + rows("fixed", np.ones(12))[2:]
     own = [failing("adaptive", "seed 0"), *rows("adaptive", np.full(12, 0.5))[1:4]]
     own += [failing("adaptive", f"seed {i}") for i in range(4, 12)]
-    found = next(c for c in contrasts(base + own) if c.arm == "adaptive")
+    found = next(c for c in contrasts(base + own) if c.method == "adaptive")
     assert (found.units, found.wins, found.losses, found.ratio) == (10, 2, 8, np.inf)
     assert found.interval == (0.5, np.inf)
     assert {t.verdict() for t in targets(base + own)} == {OPEN}
@@ -102,7 +104,8 @@ def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -
 @pytest.mark.parametrize("trouble", [{"failed": "singular"}, {"error_m": 0.5, "diverged": "ran away"}])
 def test_one_field_log_that_fails_or_diverges_misses_its_target(trouble) -> None:
     base, own = (
-        rows(arm, [e] * 8, family="field", plant="firm") for arm, e in (("fixed", 1.0), ("adaptive", 0.5))
+        rows(method, [e] * 8, family="field", plant="firm")
+        for method, e in (("fixed", 1.0), ("adaptive", 0.5))
     )
     (sound,) = targets(base + own)
     assert (sound.name, sound.verdict()) == ("G9", REACHED)
@@ -133,13 +136,15 @@ def test_an_arm_of_fewer_drives_tells_their_number() -> None:
 
 def test_drives_that_one_arm_lacks_are_left_out() -> None:
     found = contrasts(rows("fixed", [1.0, 1.0, None]) + rows("adaptive", [0.5, None, 0.1]))
-    assert [(c.arm, c.units, c.ratio) for c in found] == [("fixed", 2, 1.0), ("adaptive", 1, 0.5)]
+    assert [(c.method, c.units, c.ratio) for c in found] == [("fixed", 2, 1.0), ("adaptive", 1, 0.5)]
     assert found[1].interval is None
 
 
 def test_outages_of_one_log_make_one_unit() -> None:
-    def log(arm: str, errors: list[float]) -> list[RunScore]:
-        return [RunScore("field", "firm", "log", f"outage {i}", arm, error_m=e) for i, e in enumerate(errors)]
+    def log(method: str, errors: list[float]) -> list[RunScore]:
+        return [
+            RunScore("field", "firm", "log", f"outage {i}", method, error_m=e) for i, e in enumerate(errors)
+        ]
 
     found = contrasts(log("fixed", [1.0, 2.0, 4.0]) + log("adaptive", [0.5, 1.0, 40.0]))
     assert found[1].units == 1

@@ -10,11 +10,11 @@ from terrafusion.fusion.benchmark.methods import (
     DATA_SHEET_NOISE,
     METHODS,
     known_labels,
-    misleading,
-    most_foreign,
+    most_different_class,
     replay_options,
     shuffled,
     true_labels,
+    wrong_labels,
 )
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.policy import load_policy
@@ -93,7 +93,7 @@ def test_shuffled_labels_come_from_the_seed_and_from_all_classes() -> None:
 def test_the_most_foreign_class_is_never_the_true_one() -> None:
     for name in POLICY.names():
         if name != "unknown":
-            assert most_foreign(name, POLICY) not in (name, "unknown")
-    assert most_foreign("loose_sand", POLICY) in ("asphalt", "medium_sand")
-    assert most_foreign("lava", POLICY) == "unknown"
-    assert misleading(LABELS, POLICY).t_ns == LABELS.t_ns
+            assert most_different_class(name, POLICY) not in (name, "unknown")
+    assert most_different_class("loose_sand", POLICY) in ("asphalt", "medium_sand")
+    assert most_different_class("lava", POLICY) == "unknown"
+    assert wrong_labels(LABELS, POLICY).t_ns == LABELS.t_ns

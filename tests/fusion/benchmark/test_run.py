@@ -44,7 +44,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BenchmarkResu
 
 def test_every_arm_gives_a_row_with_its_grounds(found) -> None:
     rows = found[1].rows
-    assert [row.arm for row in rows] == list(FEW)
+    assert [row.method for row in rows] == list(FEW)
     for row in rows:
         assert row.failed == row.diverged == ""
         assert row.error_m is not None
