@@ -24,11 +24,9 @@ from terrafusion.datasets.core.channels import (
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
+from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE
 from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.datasets.writers.mcap_file import TopicMessages
-
-UNKNOWN_VARIANCE = 1e6
-"""By ROS custom: a variance this large marks a quantity that is not known."""
 
 STATUS_OF_FIX = {Fix.NONE: -1, Fix.SINGLE: 0, Fix.DGPS: 1, Fix.FLOAT: 1, Fix.FIXED: 2}
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

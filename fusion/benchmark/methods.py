@@ -12,7 +12,7 @@ from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import ModeTuning
 from terrafusion.fusion.noise.policy import Policy, SensorNoise, load_policy
 from terrafusion.fusion.terrain.classifier import UNKNOWN
-from terrafusion.fusion.terrain.external import TRUE_SOURCES
+from terrafusion.fusion.terrain.external import true_grounds
 
 DATA_SHEET_NOISE = {
     "slip_mean": 0.0,
@@ -91,16 +91,9 @@ def replay_options(method: Method, labels: GroundLabels | None, seed: int) -> di
 
 
 def true_labels(recording: Recording) -> GroundLabels | None:
-    """The true ground of a recording, or None.
-
-    From its terrain channel if annotated or simulated, else from its terrain name.
-    """
-    terrain = recording.terrain
-    if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
-        label = terrain.label.astype(str)
-        first = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
-        return GroundLabels(tuple(terrain.t_ns[first].tolist()), tuple(label[first].tolist()))
-    return GroundLabels((recording.start_ns,), (recording.terrain_name,)) if recording.terrain_name else None
+    """The true ground of a recording, or None."""
+    grounds = true_grounds(recording)
+    return GroundLabels(*zip(*grounds, strict=True)) if grounds else None
 
 
 def known_labels(labels: GroundLabels | None) -> GroundLabels | None:

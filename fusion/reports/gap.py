@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from terrafusion.fusion.benchmark.estimator_gap import Compared
 from terrafusion.fusion.reports.gap_text import (
@@ -44,9 +45,7 @@ def write_diagnosis(
     scores, failed = judged or ((), ())
     write_text(out / "diagnosis.json", json.dumps(d.to_json(), indent=1, allow_nan=False) + "\n")
     if judged is not None:
-        keys = ("mark", "references", "runs", "twin", "corrected")
-        rows = [dict(zip(keys, dataclasses.astuple(one), strict=True)) for one in scores]
-        write_text(out / "judge.json", json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        write_text(out / "judge.json", json.dumps(judge_rows(scores), indent=1, allow_nan=False) + "\n")
     sheet = Sheet()
     paths = plots.plot_paths(sheet, d, MOST_RUNS) if d.detected else []
     if d.where:
@@ -71,6 +70,12 @@ def _value(d: GapDiagnosis) -> str:
     covered = d.drives is None or not d.drives.limits()
     alike = d.verdict.kind == "no_gap" and d.detection.p_value > d.significance
     return "good" if alike and covered else "doubtful"
+
+
+def judge_rows(scores: Sequence[Compared]) -> list[dict[str, Any]]:
+    """The rows of judge.json."""
+    keys = ("mark", "references", "runs", "twin", "corrected")
+    return [dict(zip(keys, dataclasses.astuple(one), strict=True)) for one in scores]
 
 
 def _tiles(d: GapDiagnosis) -> list[Tile]:

@@ -22,7 +22,7 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.terrain.classifier import UNKNOWN
-from terrafusion.fusion.terrain.external import TRUE_SOURCES
+from terrafusion.fusion.terrain.external import true_grounds
 from terrafusion.fusion.training.ground_samples import (
     SLIP_S,
     GroundSamples,
@@ -106,13 +106,8 @@ def grounds_of(recording: Recording) -> list[tuple[int, str]]:
     Raises:
         DataError: the recording has no annotated or simulated ground.
     """
-    terrain = recording.terrain
-    if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
-        label = terrain.label.astype(object)
-        first = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
-        return list(zip(terrain.t_ns[first].tolist(), label[first].tolist(), strict=True))
-    if recording.terrain_name:
-        return [(recording.start_ns, recording.terrain_name)]
+    if grounds := true_grounds(recording):
+        return grounds
     raise DataError(
         f"{recording.name}: no ground label",
         channel="terrain",

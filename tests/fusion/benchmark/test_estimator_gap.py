@@ -18,6 +18,7 @@ from terrafusion.fusion.benchmark.estimator_gap import (
     scenario_of,
     twin_of,
 )
+from terrafusion.fusion.reports.gap import judge_rows
 from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.answer.verdict import EffectFit
@@ -78,8 +79,9 @@ def test_scores_are_means_and_a_log_that_cannot_be_scored_is_listed(
 
     recording = driven[0]
     references = [recording, dataclasses.replace(recording, name="bad")]
-    (mark,), failed = estimator_gap(fake(None, driven), [recording], references, judge)
-    assert (mark.references, mark.runs, mark.twin, mark.corrected) == (1.0, 1.0, 3.0, None)
+    scores, failed = estimator_gap(fake(None, driven), [recording], references, judge)
+    row = {"mark": "mark", "references": 1.0, "runs": 1.0, "twin": 3.0, "corrected": None}
+    assert judge_rows(scores) == [row]
     assert len(failed) == 1
     assert "no wheels" in failed[0]
 

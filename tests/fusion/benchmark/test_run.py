@@ -179,6 +179,8 @@ def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
     content = json.loads((tmp_path / "benchmark.json").read_text())
     assert content["schema"] == outputs.SCHEMA
     assert [row["arm"] for row in content["rows"]] == list(FEW)
+    assert {"arm", "base", "base_m"} <= content["contrasts"][0].keys()
+    assert not {"method", "baseline", "baseline_m"} & content["contrasts"][0].keys()
     assert content["origin"]["command"] == "terrafusion benchmark"
     text = (tmp_path / "benchmark.md").read_text()
     for cells in made[0].rows:
