@@ -116,7 +116,7 @@ BAD_VEHICLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "no source": (
         r"^  wheel_radius_m: .*$",
         "  wheel_radius_m: {value: 0.175}",
-        ("odometry.wheel_radius_m", "no source", "where the number comes from"),
+        ("odometry.wheel_radius_m", "no source", "add source: data sheet, measurement or assumed"),
     ),
     "bare number": (
         r"^  wheel_radius_m: .*$",
