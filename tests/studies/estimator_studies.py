@@ -187,7 +187,7 @@ ESTIMATOR = (
         "ground_features",
         "What carries the classification of a robot's own grounds, and is a ground never seen called new?",
         module("ground_classifier.experiments"),
-        10,
+        4,
         {
             "all_features": r"nothing +([\d.]+)",
             "forest_by_run": r"extra trees, .* by run ([\d.]+)",
