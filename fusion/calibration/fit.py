@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.motion import Drive, dead_reckoned
+from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned
 from terrafusion.fusion.calibration.numbers import WHEEL_SCALE, Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, RATIO, YAW, Nodes, Noise, Reduction, X, Y
 from terrafusion.fusion.calibration.slip import slip_process
@@ -26,7 +26,7 @@ ITERATIONS, CONVERGED = 10, 0.02
 
 
 def fit(
-    drives: Sequence[Drive],
+    drives: Sequence[MotionSegment],
     starts: Sequence[tuple[complex, float]],
     before: Knowledge,
     noise: Noise,
@@ -68,7 +68,7 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
     return dataclasses.replace(found, slip_spread=spread, slip_time_s=time_s)
 
 
-def started(drive: Drive, start: complex, yaw_rad: float, numbers: Array) -> Nodes:
+def started(drive: MotionSegment, start: complex, yaw_rad: float, numbers: Array) -> Nodes:
     """Nodes along dead reckoning from a position (east + i north) and yaw."""
     path, first = dead_reckoned(drive, numbers), drive.first
     state = np.zeros((len(first), NODE))

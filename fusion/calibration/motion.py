@@ -21,8 +21,8 @@ NODE_M, NODE_SIGMAS, LONGEST_NODE_M = 4.0, 20.0, 40.0
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """One uninterrupted stretch of a drive.
+class MotionSegment:
+    """Wheels, turns and fixes of one uninterrupted part of a drive.
 
     Attributes:
         t_s: (N + 1,) times; sample 0 is the start.
@@ -79,7 +79,7 @@ class Path:
     z_by: Complex
 
 
-def dead_reckoned(drive: Drive, numbers: Array, begin: int = 0, end: int | None = None) -> Path:
+def dead_reckoned(drive: MotionSegment, numbers: Array, begin: int = 0, end: int | None = None) -> Path:
     """The path of `drive` by wheels and turns with `numbers` (8,), from sample `begin` to `end`."""
     end = len(drive.t_s) - 1 if end is None else end
     t_s = drive.t_s[begin : end + 1]
@@ -104,7 +104,7 @@ def dead_reckoned(drive: Drive, numbers: Array, begin: int = 0, end: int | None 
     return Path(yaw, _summed(step * middle), yaw_by, z_by)
 
 
-def _speed_gained(drive: Drive, begin: int, end: int) -> Array:
+def _speed_gained(drive: MotionSegment, begin: int, end: int) -> Array:
     """Change of the wheels' speed over each sample, m/s, by central differences."""
     first, last = max(begin - 1, 0), min(end + 1, len(drive.distance_m))
     if last - first < 2:

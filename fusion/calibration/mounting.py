@@ -99,8 +99,8 @@ class MountingAngle:
         ahead = float((speed_mps[-1] - speed_mps[0]).real)
         left = float((weight * speed_mps * turn).sum().real)
         rate = (turn / dt).real
-        swung = complex(-float((weight * turn.real * rate).sum()), rate[-1] - rate[0])
-        self._windows.append((ahead, left, swung, complex((weight * gained_mps).sum())))
+        velocity_by_lever = complex(-float((weight * turn.real * rate).sum()), rate[-1] - rate[0])
+        self._windows.append((ahead, left, velocity_by_lever, complex((weight * gained_mps).sum())))
         self._moves = self._moves[-1:]
         if len(self._windows) < BLOCK:
             return False

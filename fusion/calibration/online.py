@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.fit import combined, started
-from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_due
+from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned, node_due
 from terrafusion.fusion.calibration.numbers import GNSS_DELAY, Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
@@ -175,21 +175,22 @@ class SelfCalibration:
         return float(self.known.mean[GNSS_DELAY])
 
 
-def _empty(antenna_m: complex) -> Drive:
+def _empty(antenna_m: complex) -> MotionSegment:
     none = np.zeros(0)
-    return Drive(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, np.zeros(1, dtype=int))
+    at_start = np.zeros(1, dtype=int)
+    return MotionSegment(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, at_start)
 
 
 def _extended(
-    drive: Drive,
+    drive: MotionSegment,
     samples: Sequence[tuple[float, float, float]],
     fixes: Sequence[tuple[float, float, float, float]],
     first: Sequence[int],
-) -> Drive:
+) -> MotionSegment:
     """A drive with what came since."""
     t_s, distance_m, turn_rad = np.array(samples).reshape(-1, 3).T
     fix_t_s, east_m, north_m, sigma_m = np.array(fixes).reshape(-1, 4).T
-    return Drive(
+    return MotionSegment(
         np.concatenate([drive.t_s, t_s]),
         np.concatenate([drive.distance_m, distance_m]),
         np.concatenate([drive.turn_rad, turn_rad]),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.motion import Complex, Drive, Path, dead_reckoned
+from terrafusion.fusion.calibration.motion import Complex, MotionSegment, Path, dead_reckoned
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -62,7 +62,7 @@ class Noise:
 class Nodes:
     """A drive and the estimates of its nodes: (M, 6) as `X` ... `DRIFT_N`."""
 
-    drive: Drive
+    drive: MotionSegment
     state: Array
 
 

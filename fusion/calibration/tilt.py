@@ -58,7 +58,7 @@ class MountingTilt:
         self._sum, self._outer = np.zeros(3), np.zeros((3, 3))
         self._energy, self._freedom = np.zeros(2), 0
         self.turns: tuple[Angle, Angle] | None = None
-        self._climb_m = self._rolled_m = self._swung = self._speed_mps = 0.0
+        self._climb_m = self._rolled_m = self._climb_by_lever = self._speed_mps = 0.0
         self._since_s = self._walked_m = self.driven_m = 0.0
         self._mean, self._P = np.zeros(4), np.diag([UNKNOWN_M, UNKNOWN_M, WIDE_RAD, PLACE_M]) ** 2
         self._gathered, self._count, self._squares = np.zeros(5), 0, 0.0
@@ -93,7 +93,7 @@ class MountingTilt:
         """Motion over `dt_s`; True when the angles of the turns changed."""
         moved_m = speed_mps * dt_s
         self._climb_m += moved_m * float(force_mps2[0]) / GRAVITY_MPS2
-        self._swung += moved_m * float(gyro_radps[2]) ** 2 / GRAVITY_MPS2
+        self._climb_by_lever += moved_m * float(gyro_radps[2]) ** 2 / GRAVITY_MPS2
         self._rolled_m += moved_m
         self._walked_m += abs(moved_m)
         self.driven_m += abs(moved_m)
@@ -134,10 +134,10 @@ class MountingTilt:
     def height(self, up_m: float, sigma_m: float) -> bool:
         """A height of a fix at the end of the motion; True when the angle changed."""
         climb_m = self._climb_m - 0.5 * self._speed_mps**2 / GRAVITY_MPS2
-        self._gathered += [1.0, up_m - climb_m, self._rolled_m, self._swung, sigma_m]
+        self._gathered += [1.0, up_m - climb_m, self._rolled_m, self._climb_by_lever, sigma_m]
         if self._since_s < FIX_INTERVAL_S or not self._walked_m:
             return False
-        _, measured, rolled, swung, sigma_m = (self._gathered / self._gathered[0]).tolist()
+        _, measured, rolled, climb_by_lever, sigma_m = (self._gathered / self._gathered[0]).tolist()
         dt, walked, self._since_s, self._walked_m = self._since_s, self._walked_m, 0.0, 0.0
         self._gathered[:] = 0.0
         kept = math.exp(-dt / HEIGHT_TIME_S) if self._count else 0.0
@@ -146,7 +146,7 @@ class MountingTilt:
         self._P *= np.outer(F, F)
         self._P[0, 0] += 2.0 * sigma_m**2 * dt / HEIGHT_WALK_S + PATH_SIGMA**2 * walked
         self._P[1, 1] += sigma_m**2 * (1.0 - kept**2)
-        H = np.array([1.0, 1.0, rolled, swung])
+        H = np.array([1.0, 1.0, rolled, climb_by_lever])
         left = measured - float(H @ self._mean)
         PH = self._P @ H
         S = float(H @ PH) + (0.2 * sigma_m) ** 2 + WHITE_M**2

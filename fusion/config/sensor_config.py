@@ -51,7 +51,7 @@ class SensorConfig:
     def __post_init__(self) -> None:
         if self.imu not in IMU_KINDS:
             raise ConfigError(f"unknown kind of IMU '{self.imu}'", remedy=f"give {', '.join(IMU_KINDS)}")
-        if self.yaw == "nobody" and not self.gnss:
+        if self.yaw == "none" and not self.gnss:
             raise DataError(
                 "nothing tells the heading: no gyro z, body speed instead of two wheels, and no GNSS",
                 channel="imu, wheels and gnss",
@@ -65,12 +65,12 @@ class SensorConfig:
 
     @property
     def yaw(self) -> str:
-        """Source of the yaw rate: "gyro", "steering", "wheels" or "nobody"."""
+        """Source of the yaw rate: "gyro", "steering", "wheels" or "none"."""
         if self.imu != "none":
             return "gyro"
         if self.steered:
             return "steering"
-        return "wheels" if self.sides else "nobody"
+        return "wheels" if self.sides else "none"
 
     def rig(self, rig: Rig) -> Rig:
         """The robot as the graph sees it: the effective track where yaw is the wheels'."""
@@ -100,7 +100,7 @@ class SensorConfig:
             )
         elif self.yaw == "steering":
             notes.append("yaw is taken from the steering angles and the wheelbase; their zero is estimated")
-        elif self.yaw == "nobody":
+        elif self.yaw == "none":
             notes.append("the log has body speed only and no gyro: the heading comes from GNSS alone")
         if not self.sides and not self.steered and self.yaw == "gyro":
             notes.append("the log has body speed only: the wheels tell nothing of yaw")

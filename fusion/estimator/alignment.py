@@ -16,8 +16,8 @@ from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.inputs.door import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream, turned
+from terrafusion.fusion.inputs.validation import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
 from terrafusion.fusion.noise.policy import SensorNoise
 
 STILL_MPS = 0.01

@@ -44,7 +44,7 @@ LEARNED_S = 10.0
 PRIOR_MOVES, MOST_MOVES = 3.0, 30.0
 """Moves for which the data sheet counts, and those that are remembered (assumed)."""
 LARGEST_MOVE = 4.0
-"""Ratio of a move's square over the expected one from which it counts no more: the robot slid (assumed)."""
+"""Ratio of a move's square over the expected one from which it counts no more: the robot skidded (assumed)."""
 TELLING = 0.1
 """Least share of a move that the estimate can show."""
 
@@ -58,6 +58,7 @@ class DriftWatch:
         fresh: fixes that show the drift came into the graph since the last test.
         seen: time, drift east and north, m, and mean variance of it, m2.
         sheet_m: sigma by the data sheet, the largest.
+        _reference: estimate, as in `seen`, from which the next move is learned.
     """
 
     sigma_m: float
@@ -65,7 +66,7 @@ class DriftWatch:
     fresh: bool = False
     seen: list[tuple[int, float, float, float]] = field(default_factory=list)
     sheet_m: float = field(init=False)
-    _far: tuple[int, float, float, float] | None = None
+    _reference: tuple[int, float, float, float] | None = None
     _moves: float = 0.0
 
     def __post_init__(self) -> None:
@@ -77,8 +78,8 @@ class DriftWatch:
         `variance_m2` is that of an axis of the estimate.
         """
         east_m, north_m = drift_m.tolist()
-        if self._far is not None:
-            before_ns, e_m, n_m, before_m2 = self._far
+        if self._reference is not None:
+            before_ns, e_m, n_m, before_m2 = self._reference
             kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
             if t_ns - before_ns < LEARNED_S * 1e9:
                 return
@@ -90,7 +91,7 @@ class DriftWatch:
                 gain = 1.0 / (PRIOR_MOVES + self._moves)
                 sigma_m = self.sigma_m * math.sqrt(1.0 + gain * (min(square, LARGEST_MOVE) - 1.0))
                 self.sigma_m = min(max(sigma_m, least_m), self.sheet_m)
-        self._far = t_ns, east_m, north_m, variance_m2
+        self._reference = t_ns, east_m, north_m, variance_m2
 
     def test_wheels(
         self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise, least_m: float
@@ -131,4 +132,4 @@ class DriftWatch:
     def restart(self) -> None:
         """Forget what was seen: the drift state is new."""
         self.seen.clear()
-        self._far = None
+        self._reference = None

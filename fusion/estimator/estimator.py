@@ -57,8 +57,6 @@ from terrafusion.fusion.graph.planar import (
     yaw_of_wheels,
 )
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
-from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
-from terrafusion.fusion.inputs.leaps import FixesAhead
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import (
     LONGEST_PAUSE_NS,
@@ -68,6 +66,8 @@ from terrafusion.fusion.inputs.streams import (
     is_gap,
     usual_interval_s,
 )
+from terrafusion.fusion.inputs.time_jumps import EarlyFixes
+from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
@@ -109,8 +109,8 @@ class Estimator:
         config, rig = self.config, self.config.rig
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
-        self.newest = self.imu.late.leap.newest
-        self.wheels, self.fixes = WheelStream(self.newest), FixesAhead(self.newest)
+        self.newest = self.imu.late.jump.newest
+        self.wheels, self.fixes = WheelStream(self.newest), EarlyFixes(self.newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
         self.steering, self._turn = SteeringStream(rig, self.newest), steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu, rig.drive in SKIDDING)

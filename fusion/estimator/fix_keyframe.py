@@ -12,7 +12,7 @@ from terrafusion.fusion.estimator.gates import GateDecision
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever
 from terrafusion.fusion.graph.key_state import ANTENNA, GNSS_DELAY, cross
-from terrafusion.fusion.inputs.door import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 
 LARGE_TURN_RAD = 0.05
 APART_NS = 1_000_000_000

@@ -25,7 +25,7 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
 from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, NAV, POSE, SLIP, VELOCITY, cross
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
-from terrafusion.fusion.inputs.door import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
 
@@ -93,7 +93,7 @@ class GnssUpdater:
         self.track = DeadReckoning(self.antenna_m)
         self.turned = 0
         self.skid = skid or SkidDetector()
-        self.scale, self.white, self._handled = 1.0, WHITE_SHARE, 1.0
+        self.scale, self.white, self._applied_scale = 1.0, WHITE_SHARE, 1.0
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._class: Fix | None = None
         self._class_scale: dict[Fix | None, float] = {}
@@ -183,7 +183,7 @@ class GnssUpdater:
                 if self._pair is not None:
                     self.track.keep(self._pair)
                 self._update_scale(self.track.scatter(), self.track.white_share())
-                if self.scale > OPTIMISTIC_SCATTER * self._handled:
+                if self.scale > OPTIMISTIC_SCATTER * self._applied_scale:
                     self._doubt_used(chain, fix)
                 if self.skid.friction is not None:
                     self.skid.friction.score_fix(fix, self.scale)
@@ -250,7 +250,11 @@ class GnssUpdater:
 
     def _doubt_used(self, chain: Chain, fix: GnssFix) -> None:
         """Doubt what fixes of a far too small sigma have made of the window, once their scatter is known."""
-        first, ratio, self._handled = self._handled == 1.0, self.scale / self._handled, self.scale
+        first, ratio, self._applied_scale = (
+            self._applied_scale == 1.0,
+            self.scale / self._applied_scale,
+            self.scale,
+        )
         for k, node in enumerate(chain.nodes, chain.first):
             for old in node.fixes[:]:
                 wider = old.sigma_m * np.array([ratio, ratio, 1.0])

@@ -17,8 +17,8 @@ from terrafusion.fusion.calibration.tilt import LEAST_SIGMA_RAD, MountingTilt
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
-from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import ImuStream
+from terrafusion.fusion.inputs.validation import GnssFix
 
 LEVEL = ("imu_roll_rad", "imu_pitch_rad")
 """The two angles by their names in the vehicle file."""

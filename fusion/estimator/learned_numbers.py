@@ -56,20 +56,20 @@ TURN_TIME_S = 10.0
 
 CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 """Numbers that correct a sensor; the others only describe its noise or belong to another state."""
-LOOK_ALIKE = [*CORRECTED, WHEEL_DELAY, COURSE_LAG]
-"""Numbers of which one can look like another."""
+CORRELATED = [*CORRECTED, WHEEL_DELAY, COURSE_LAG]
+"""Numbers whose errors are correlated: one can look like another."""
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 """Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
 rotation look alike (assumed)."""
 MOST_SPREAD = 0.1
-"""Spread of slip beyond which the wheels do not roll, and a slide looks like a delay (assumed)."""
-SLIDE_SEEN_NS, STEPS_KEPT = 15_000_000_000, 8
-"""A slide shows within this time (assumed); so many steps of learning reach further back."""
+"""Spread of slip beyond which the wheels do not roll, and a skid looks like a delay (assumed)."""
+SKID_DETECTION_NS, STEPS_KEPT = 15_000_000_000, 8
+"""A skid shows within this time (assumed); so many steps of learning reach further back."""
 LEAST_LATE_S, LEAST_LATE_TURNING_S, TURNING_RAD, MOST_MISFIT = 0.3, 0.15, 3.0, 10.0
 """Fixes later than the first (wheels that spin look less late), or than the second where the robot turned by
-so much, another antenna or another gyro can look like a slide; they explain it if the fixes then lie within
-about three of their sigma: a slide leaves a hundred and more (assumed)."""
-SURELY_IMITATED = np.array([0.0, 0.03, 0.03, 0.03])
+so much, another antenna or another gyro can look like a skid; they explain it if the fixes then lie within
+about three of their sigma: a skid leaves a hundred and more (assumed)."""
+UNMODELLED_SIGMA = np.array([0.0, 0.03, 0.03, 0.03])
 """1 sigma of what slip adds to these numbers on any ground (turn share, m, m, s; assumed)."""
 CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
@@ -107,7 +107,7 @@ class LearnedNumbers:
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known, self._skids = prior, config.rig.drive in SKIDDING
-        self._before_slide: Knowledge | None = None
+        self._before_skid: Knowledge | None = None
         self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
             self._apply(prior, 0, known.wheel_scale is not None)
@@ -154,9 +154,9 @@ class LearnedNumbers:
             return
         skid = self._gnss.skid
         if skid.friction is not None and skid.friction.leads:
-            self._forget(self._before_slide or self._untouched(chain, learning))
+            self._forget(self._before_skid or self._untouched(chain, learning))
             return
-        self._mark_slide(chain, learning, skid.rate_m2ps > 0.0)
+        self._handle_skid(chain, learning, skid.rate_m2ps > 0.0)
         pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
         t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
         learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
@@ -168,7 +168,7 @@ class LearnedNumbers:
         learning = self.calibration
         if learning is None or not learning.advance():
             return False
-        if self._before_slide is not None and not self._explained(learning):
+        if self._before_skid is not None and not self._explained(learning):
             return False
         self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
         self._past.append((t_ns, self._known))
@@ -224,25 +224,25 @@ class LearnedNumbers:
             if i != GYRO_BIAS
         ]
 
-    def _mark_slide(self, chain: Chain, learning: SelfCalibration, slides: bool) -> None:
-        """Keep what was known before a slide, or before wrong numbers that look like one.
+    def _handle_skid(self, chain: Chain, learning: SelfCalibration, skids: bool) -> None:
+        """Keep what was known before a skid, or before wrong numbers that look like one.
 
-        Where other numbers explain it, learning goes on; after a slide it begins again.
+        Where other numbers explain it, learning goes on; after a skid it begins again.
         """
-        if slides and self._before_slide is None:
-            self._before_slide = self._untouched(chain, learning)
-        elif not slides and self._before_slide is not None:
+        if skids and self._before_skid is None:
+            self._before_skid = self._untouched(chain, learning)
+        elif not skids and self._before_skid is not None:
             if not self._explained(learning):
-                self._forget(self._before_slide)
-            self._before_slide = None
+                self._forget(self._before_skid)
+            self._before_skid = None
 
     def _untouched(self, chain: Chain, learning: SelfCalibration) -> Knowledge:
-        """What was known before a slide that shows now began."""
-        until_ns = chain.nodes[-1].t_ns - SLIDE_SEEN_NS
+        """What was known before a skid that shows now began."""
+        until_ns = chain.nodes[-1].t_ns - SKID_DETECTION_NS
         return next((known for t_ns, known in reversed(self._past) if t_ns <= until_ns), learning.before)
 
     def _explained(self, learning: SelfCalibration) -> bool:
-        """Whether other numbers of a robot with rolling wheels explain a drive that looks like a slide."""
+        """Whether other numbers of a robot with rolling wheels explain a drive that looks like a skid."""
         known = learning.known
         if learning.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
             return False
@@ -252,7 +252,7 @@ class LearnedNumbers:
         return bool((np.abs(known.mean - self._before.mean)[CORRECTED] > least).any())
 
     def _forget(self, known: Knowledge) -> None:
-        self._before_slide, self._known = None, known
+        self._before_skid, self._known = None, known
         self._past.clear()
         if self.calibration is not None:
             self.calibration.restart(known)
@@ -293,11 +293,11 @@ class LearnedNumbers:
         off, sigma = known.mean - self._before.mean, known.sigma
         corrected, size = self._before.mean[CORRECTED], np.abs(off[CORRECTED])
         limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
-        limit = limit * np.hypot(sigma[CORRECTED], SURELY_IMITATED)
+        limit = limit * np.hypot(sigma[CORRECTED], UNMODELLED_SIGMA)
         rolling = known.slip_spread < MOST_SPREAD
         self._clear = clear = (size > limit) & (size > LEAST_CORRECTION) & rolling
         shown = [i for i, is_clear in zip(CORRECTED, clear.tolist(), strict=True) if is_clear]
-        kept = [i for i in LOOK_ALIKE if i not in shown and abs(off[i]) < REFUTED_SIGMA * sigma[i]]
+        kept = [i for i in CORRELATED if i not in shown and abs(off[i]) < REFUTED_SIGMA * sigma[i]]
         covariance = known.covariance
         gain = covariance[np.ix_(shown, kept)] @ np.linalg.pinv(covariance[np.ix_(kept, kept)])
         corrected[clear] += off[shown] - gain @ off[kept]
@@ -322,7 +322,7 @@ def _prior(config: EstimatorConfig) -> Knowledge:
 
 def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration | None:
     inputs, sensors = config.inputs, config.rig.sensors
-    if not config.self_calibrate or config.calibrate or not inputs.gnss or inputs.yaw == "nobody":
+    if not config.self_calibrate or config.calibrate or not inputs.gnss or inputs.yaw == "none":
         return None
     wheels = inputs.yaw in ("wheels", "steering")
     noise = Noise(

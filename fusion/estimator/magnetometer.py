@@ -72,7 +72,7 @@ def yaw_jacobian(R: Array) -> Array:
     return np.asarray((R[0, 0] * d_y - R[1, 0] * d_x) / across)
 
 
-def yaw_factor(k: int, R: Array, turn_rad: float, sigma_rad: float) -> gtsam.NonlinearFactor:
+def heading_factor(k: int, R: Array, turn_rad: float, sigma_rad: float) -> gtsam.NonlinearFactor:
     """Heading of keyframe k: that of `R` (3, 3) plus `turn_rad`; roll and pitch stay free.
 
     A horizontal direction of the world, seen from the turned body. The error's second part is its vertical
@@ -264,7 +264,7 @@ class MagnetometerAiding:
         own = self.bias.measure(innovation, H, variance, noise)
         if own is None:
             return False
-        chain.add(chain.last, yaw_factor(chain.last, R, own.innovation, own.sigma), "X")
+        chain.add(chain.last, heading_factor(chain.last, R, own.innovation, own.sigma), "X")
         return True
 
     def _heading_of_field(self, R: Array, field: Array) -> tuple[float, Array]:

@@ -24,7 +24,7 @@ from terrafusion.datasets.core.messages import (
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.steering import front_ratio
-from terrafusion.fusion.inputs.door import as_number, as_numbers
+from terrafusion.fusion.inputs.validation import as_number, as_numbers
 from terrafusion.fusion.terrain.external import TRUE_SOURCES, known_probabilities
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from terrafusion.datasets.core.printable import times
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.inputs.door import MOST_MPS, MOST_MPS2, MOST_RADPS
-from terrafusion.fusion.inputs.leaps import LEAP_NS
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
+from terrafusion.fusion.inputs.time_jumps import JUMP_NS
+from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
@@ -32,10 +32,10 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     if gnss.velocities_refused:
         notes.append(f"{gnss.velocities_refused} GNSS velocities were far from what wheels and IMU allow")
     if gnss.skid.refutations:
-        notes.append(f"fixes showed {times(gnss.skid.refutations)} that the robot slid beside its wheels")
+        notes.append(f"fixes showed {times(gnss.skid.refutations)} that the wheels skidded")
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
-        notes.append(f"at its end the robot slid, with a friction limit of {friction.mps2:.1f} m/s2")
+        notes.append(f"at its end the robot skidded, with a friction limit of {friction.mps2:.1f} m/s2")
     if level := estimator.learned.mounting.level.note():
         notes.append(level)
     if estimator.imu.spikes:
@@ -65,13 +65,13 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"{ahead} samples of {channel} lay far ahead of IMU and wheels: they were left out")
     if dropped := estimator.fixes.dropped:
         notes.append(
-            f"{dropped} GNSS fixes lay more than {LEAP_NS * 1e-9:g} s ahead of IMU and wheels, and "
+            f"{dropped} GNSS fixes lay more than {JUMP_NS * 1e-9:g} s ahead of IMU and wheels, and "
             "of fixes that came after them: they were left out"
         )
     for stream in (estimator.imu.late, estimator.wheels.late):
-        if stream.leap.dropped:
+        if stream.jump.dropped:
             notes.append(
-                f"{stream.leap.dropped} samples of {stream.channel} lay more than {LEAP_NS * 1e-9:g} s ahead "
+                f"{stream.jump.dropped} samples of {stream.channel} lay more than {JUMP_NS * 1e-9:g} s ahead "
                 "of all others: they were left out"
             )
         if stream.too_late:

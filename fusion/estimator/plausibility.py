@@ -25,8 +25,8 @@ from terrafusion.fusion.estimator.dead_reckoning import (
     DeadReckoning,
     FixPair,
 )
-from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.fusion.inputs.validation import GnssFix
 
 SLACK_M, SLACK_SIGMA = 1.0, 4.0
 """Beyond the reach of the wheels: lever arm and delay (assumed), and sigmas of both fixes."""

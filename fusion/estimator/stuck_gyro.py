@@ -11,9 +11,9 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import SensorConfig, yaw_factor
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.door import as_numbers, checked_time
 from terrafusion.fusion.inputs.gyro_unit import GyroUnit
 from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.fusion.inputs.validation import as_numbers, checked_time
 from terrafusion.fusion.noise.policy import SensorNoise
 
 STUCK_NS, STUCK_SAMPLES = 500_000_000, 5

@@ -318,7 +318,7 @@ class _Velocities:
             np.array([getattr(one, name) for one in flat]).reshape(-1, 3)
             for name in ("velocity_mps", "lever_m")
         )
-        self._swing = np.array([one.swing for one in flat]).reshape(-1, 3, 3)
+        self._lever_matrix = np.array([one.lever_matrix for one in flat]).reshape(-1, 3, 3)
         self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 3, 1)
 
     def fill(self, rows: Array, values: gtsam.Values, begin: int, R: Array, linear: Array) -> None:
@@ -329,13 +329,13 @@ class _Velocities:
         R, antenna = R[at], slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
         lever = self._lever.copy()
         lever[:, :2] += linear[at][:, antenna]
-        lever_velocity = np.einsum("kij,kj->ki", self._swing, lever)
+        lever_velocity = np.einsum("kij,kj->ki", self._lever_matrix, lever)
         velocity = np.array([values.atVector(V(begin + int(i))) for i in at])
         H = np.zeros((len(at), 3, dim + 1))
         H[:, :, :3] = np.cross(R, lever_velocity[:, None, :]) * -1.0  # -R skew(s), row by row
         H[:, :, VELOCITY] = np.eye(3)
         if dim >= ANTENNA.stop:
-            H[:, :, ANTENNA] = (R @ self._swing)[:, :, :2]
+            H[:, :, ANTENNA] = (R @ self._lever_matrix)[:, :, :2]
         H[:, :, -1] = self._velocity - velocity - np.einsum("kij,kj->ki", R, lever_velocity)
         place = (self._row[:, None] + np.arange(3))[:, :, None]
         rows[at[:, None, None], place, np.r_[0:dim, 2 * dim]] = H / self._sigma

@@ -108,7 +108,7 @@ class PlanarPreintegrator(Preintegrator):
 
     Args:
         spec: noise of the gyro, where yaw is the gyro's.
-        yaw: source of the yaw rate: "gyro", "steering", "wheels" or "nobody".
+        yaw: source of the yaw rate: "gyro", "steering", "wheels" or "none".
         skids: whether the wheels skid in a turn.
     """
 
@@ -134,7 +134,7 @@ class PlanarPreintegrator(Preintegrator):
         """Noise density of the yaw rate, rad/s/sqrt(Hz), while turning at `rate_radps`."""
         if self.yaw == "gyro":
             return self.spec.gyro_noise_radps_sqrthz * inflation
-        if self.yaw == "nobody":
+        if self.yaw == "none":
             return UNKNOWN_YAW_DENSITY_RADPS
         steered = self.yaw == "steering"
         share, floor = (

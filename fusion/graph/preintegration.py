@@ -47,7 +47,7 @@ class Preintegrator:
         With a replaced spike the sensor's noise is inflated by `HELD_INFLATION`.
         """
         held = any(p.gyro_held for p in segments), any(p.accel_held for p in segments)
-        noise = _less_sure(noise, *held) if any(held) else noise
+        noise = inflated_for_replaced_samples(noise, *held) if any(held) else noise
         # Steps of 5 % keep the number of parameter sets small.
         inflations = *noise.gyro_axes(), noise.accel_inflation
         key = tuple(round(math.log(inflation) / STEP) for inflation in inflations)
@@ -87,6 +87,7 @@ def _diagonal(sigma: Array | float) -> Array:
     return np.asarray(np.eye(3) * sigma**2)
 
 
-def _less_sure(noise: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
+def inflated_for_replaced_samples(noise: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
+    """The noise, `HELD_INFLATION` times larger for sensors of which a spike was replaced."""
     names = ("gyro_inflation", "gyro_yaw_inflation") * gyro + ("accel_inflation",) * accel
     return dataclasses.replace(noise, **{name: HELD_INFLATION * getattr(noise, name) for name in names})

@@ -29,18 +29,18 @@ class GnssVelocity:
         velocity_mps: (3,) of the antenna, or of the body origin, world.
         sigma_mps: 1 sigma (3,), white; large along an axis that is not measured.
         lever_m: (3,) the antenna's place in the vehicle file, body.
-        lever_rate_radps: (3, 3), see `lever_arm_velocity`; None where the velocity is the body origin's.
+        velocity_by_lever: (3, 3), see `lever_arm_velocity`; None where the velocity is the body origin's.
     """
 
     velocity_mps: Array
     sigma_mps: Array
     lever_m: Array = field(default_factory=lambda: np.zeros(3))
-    lever_rate_radps: Array | None = None
+    velocity_by_lever: Array | None = None
 
     @property
-    def swing(self) -> Array:
-        """`lever_rate_radps`, zero where there is none."""
-        return np.zeros((3, 3)) if self.lever_rate_radps is None else self.lever_rate_radps
+    def lever_matrix(self) -> Array:
+        """`velocity_by_lever`, zero where there is none."""
+        return np.zeros((3, 3)) if self.velocity_by_lever is None else self.velocity_by_lever
 
 
 def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
@@ -55,7 +55,7 @@ def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
 def residual(velocity: GnssVelocity, pose: Any, velocity_mps: Array, linear: Array) -> Array:
     """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
-    lever_velocity = pose.rotation().matrix() @ velocity.swing @ lever
+    lever_velocity = pose.rotation().matrix() @ velocity.lever_matrix @ lever
     return np.asarray(velocity_mps + lever_velocity - velocity.velocity_mps)
 
 
@@ -64,15 +64,15 @@ def jacobians(velocity: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, 
     R = pose.rotation().matrix()
     lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
     H_pose, H = np.zeros((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))
-    H_pose[:, :3] = -R @ skew(velocity.swing @ lever)
-    H[:, _ANTENNA] = (R @ velocity.swing)[:, :2]
+    H_pose[:, :3] = -R @ skew(velocity.lever_matrix @ lever)
+    H[:, _ANTENNA] = (R @ velocity.lever_matrix)[:, :2]
     return H_pose, np.eye(3), H
 
 
 def rows(velocity: GnssVelocity, point: KeyState, dim: int) -> Array:
     """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
     out = np.zeros((3, dim + 1))
-    if velocity.lever_rate_radps is None:
+    if velocity.velocity_by_lever is None:
         out[_AXES, VELOCITY.start + _AXES] = 1.0 / velocity.sigma_mps
         out[:, dim] = (velocity.velocity_mps - point.velocity) / velocity.sigma_mps
         return out

@@ -4,8 +4,8 @@ import bisect
 import math
 
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.inputs.door import as_number, checked_time
 from terrafusion.fusion.inputs.streams import Lateness, Newest
+from terrafusion.fusion.inputs.validation import as_number, checked_time
 
 LONGEST_HOLD_S = 1.0
 """An angle holds for so long, or for three intervals of slower samples."""
@@ -38,7 +38,7 @@ class SteeringStream:
             self.impossible += 1
             return
         per_m = (math.tan(front_rad) - math.tan(rear_rad)) / self._wheelbase_m
-        for at_ns, value in self.late.leap.admitted((t_ns, per_m)):
+        for at_ns, value in self.late.jump.admitted((t_ns, per_m)):
             for _ in range(self.late.from_future(at_ns, self.t_ns)):
                 self.t_ns.pop()
                 self.per_m.pop()

@@ -12,7 +12,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
-from terrafusion.fusion.inputs.door import (
+from terrafusion.fusion.inputs.time_jumps import CONFIRMED, JUMP_NS, Newest, TimeJump
+from terrafusion.fusion.inputs.validation import (
     MOST_MPS,
     MOST_MPS2,
     MOST_RADPS,
@@ -22,10 +23,9 @@ from terrafusion.fusion.inputs.door import (
     beyond,
     checked_time,
 )
-from terrafusion.fusion.inputs.door import (
+from terrafusion.fusion.inputs.validation import (
     GnssFix as GnssFix,
 )
-from terrafusion.fusion.inputs.leaps import CONFIRMED, LEAP_NS, Leap, Newest
 
 
 @dataclass(eq=False)
@@ -94,26 +94,26 @@ class Lateness:
         wait_ns: longest lateness so far, of those up to `LONGEST_WAIT_S`.
         used_ns: end of what the keyframes have used.
         too_late: number of samples left out because their keyframe had been made.
-        leap: samples that come far ahead.
+        jump: samples that come far ahead.
     """
 
     def __init__(self, channel: str, newest: Newest | None = None) -> None:
         self.channel = channel
-        self.leap = Leap(newest or Newest(), channel)
+        self.jump = TimeJump(newest or Newest(), channel)
         self.wait_ns = 0
         self.used_ns: int | None = None
         self.too_late = 0
 
     def from_future(self, t_ns: int, times: list[int]) -> int:
-        """How many of the newest samples, fewer than show a leap, have times that were wrong; before the
+        """How many of the newest samples, fewer than show a jump, have times that were wrong; before the
         start only."""
         if self.used_ns is not None:
             return 0
-        ahead = len(times) - bisect.bisect_right(times, t_ns + LEAP_NS)
+        ahead = len(times) - bisect.bisect_right(times, t_ns + JUMP_NS)
         if not 0 < ahead < CONFIRMED:
             return 0
-        self.leap.dropped += ahead
-        self.leap.newest.t_ns = t_ns
+        self.jump.dropped += ahead
+        self.jump.newest.t_ns = t_ns
         return ahead
 
     def place(self, t_ns: int, times: list[int]) -> int | None:
@@ -187,7 +187,7 @@ class ImuStream:
         if beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2):
             self.impossible += 1
             return
-        for sample in self.late.leap.admitted((t_ns, gyro, accel)):
+        for sample in self.late.jump.admitted((t_ns, gyro, accel)):
             self._insert(*sample)
 
     def _insert(self, t_ns: int, gyro: Array, accel: Array) -> None:
@@ -338,7 +338,7 @@ class WheelStream:
             self.impossible += 1
             return
         counted = None if left_m is None or right_m is None else moved[:2]
-        for sample in self.late.leap.admitted((t_ns, left_mps, right_mps, counted)):
+        for sample in self.late.jump.admitted((t_ns, left_mps, right_mps, counted)):
             self._insert(*sample)
 
     def _insert(

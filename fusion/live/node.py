@@ -34,9 +34,16 @@ from terrafusion.datasets.readers.ros.static_frames import STATIC, StaticFrames
 from terrafusion.fusion.estimate.estimate import STATUS, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.inputs.door import MOST_HEIGHT_M
-from terrafusion.fusion.inputs.leaps import CONFIRMED, CONFIRMED_NS, LEAP_NS, FixesAhead, Leap, Newest
 from terrafusion.fusion.inputs.streams import MOST_LATE_S
+from terrafusion.fusion.inputs.time_jumps import (
+    CONFIRMED,
+    CONFIRMED_NS,
+    JUMP_NS,
+    EarlyFixes,
+    Newest,
+    TimeJump,
+)
+from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.loop import live_estimator
 from terrafusion.fusion.live.ordered import OrderedSamples
@@ -215,8 +222,8 @@ class LiveNode:
 
     def _begin_ordering(self) -> None:
         self._ordered = OrderedSamples("imu", self.options.wait_s)
-        self._leap, self._back = Leap(Newest()), 0
-        self._fixes_ahead = FixesAhead(self._leap.newest)
+        self._jump, self._back = TimeJump(Newest()), 0
+        self._early_fixes = EarlyFixes(self._jump.newest)
         self._received_ns = 0
         self._ahead_ns: int | None = None
         self._published_ns: int | None = None
@@ -279,14 +286,14 @@ class LiveNode:
             self._order(t_ns, kind, sample, message.receipt_ns)
 
     def _order(self, t_ns: int, kind: str, sample: Any, receipt_ns: int) -> None:
-        newest_ns = self._leap.newest.t_ns
+        newest_ns = self._jump.newest.t_ns
         if kind == "gnss":
-            for one in self._fixes_ahead.in_order(t_ns, sample):
+            for one in self._early_fixes.in_order(t_ns, sample):
                 self._ordered.add(one[0], kind, one[1])
             return
         if kind != "imu":
-            if kind == "wheels" and not self._leap.newest.leaps(t_ns):
-                self._leap.newest.taken += 1  # an IMU that leaps alone is not followed
+            if kind == "wheels" and not self._jump.newest.is_jump(t_ns):
+                self._jump.newest.used_count += 1  # an IMU that jumps alone is not followed
                 self._ahead_ns = None
             self._ordered.add(t_ns, kind, sample)
             return
@@ -300,19 +307,19 @@ class LiveNode:
         if self._is_ahead(t_ns, receipt_ns):
             self.counts["refused"] += 1
             return
-        for one in self._leap.admitted((t_ns, sample)):
+        for one in self._jump.admitted((t_ns, sample)):
             self._ordered.add(one[0], kind, one[1])
-        for one in self._fixes_ahead.reached():
+        for one in self._early_fixes.reached():
             self._ordered.add(one[0], "gnss", one[1])
 
     def _is_ahead(self, t_ns: int, receipt_ns: int) -> bool:
-        """Whether the stamps of the IMU leap ahead of the time of this computer; begins anew where they stay.
+        """Whether the stamps of the IMU jump ahead of the time of this computer; begins anew where they stay.
 
         A bag that is played has stamps of the past.
         """
-        newest_ns = self._leap.newest.t_ns
+        newest_ns = self._jump.newest.t_ns
         before_ns = t_ns if newest_ns is None else newest_ns
-        if t_ns - receipt_ns > LEAP_NS >= before_ns - self._received_ns and self._leap.newest.leaps(t_ns):
+        if t_ns - receipt_ns > JUMP_NS >= before_ns - self._received_ns and self._jump.newest.is_jump(t_ns):
             if self._ahead_ns is None:
                 self._ahead_ns = t_ns
             if t_ns - self._ahead_ns < CONFIRMED_NS:

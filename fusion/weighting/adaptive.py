@@ -13,8 +13,8 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State, WeightChange
 from terrafusion.fusion.grounds.learner import FrictionBank, GroundLearner
 from terrafusion.fusion.grounds.memory import GroundMemory
-from terrafusion.fusion.inputs.door import as_numbers
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.validation import as_numbers
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window

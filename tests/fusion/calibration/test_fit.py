@@ -10,7 +10,7 @@ import pytest
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import reduction
 from terrafusion.fusion.calibration.fit import fit, information_gained, refined, started
-from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_starts
+from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned, node_starts
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -36,7 +36,7 @@ def figure(
     slip: float = 0.0,
     seed: int = 0,
     straight: bool = False,
-) -> Drive:
+) -> MotionSegment:
     """Winding at changing speed; what the sensors of a robot with `numbers` measure of it."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, STEP_S)
@@ -61,7 +61,7 @@ def figure(
     sigma = np.full(len(at), max(fix_sigma_m, 0.01))
     distance = speed * STEP_S / ratio
     first = node_starts(t, distance, float(sigma[0]))
-    return Drive(t, distance, measured, stamps, fix, sigma, 0j, first)
+    return MotionSegment(t, distance, measured, stamps, fix, sigma, 0j, first)
 
 
 def test_derivatives_of_the_path_are_those_of_finite_differences() -> None:

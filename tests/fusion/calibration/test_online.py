@@ -10,7 +10,7 @@ import pytest
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import online
-from terrafusion.fusion.calibration.motion import Drive
+from terrafusion.fusion.calibration.motion import MotionSegment
 from terrafusion.fusion.calibration.numbers import COURSE_LAG, GNSS_DELAY, NUMBERS, Knowledge
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -19,7 +19,7 @@ from tests.fusion.calibration.test_fit import NOISE, PRIOR, STEP_S, TRUE, figure
 
 
 def driven(
-    drive: Drive,
+    drive: MotionSegment,
     learning: SelfCalibration,
     begin_ns: int = 0,
     until: Callable[[], bool] = lambda: False,
@@ -176,7 +176,7 @@ def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior()
     assert learning.gnss_delay_s == known.mean[GNSS_DELAY] != PRIOR.mean[GNSS_DELAY]
 
 
-def step_times(drive: Drive) -> tuple[list[float], list[int]]:
+def step_times(drive: MotionSegment) -> tuple[list[float], list[int]]:
     """When steps begin, and how many nodes there are then."""
     learning, times_s, nodes = SelfCalibration(PRIOR, NOISE, 0j), list[float](), list[int]()
 

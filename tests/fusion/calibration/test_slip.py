@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.motion import Drive, node_starts
+from terrafusion.fusion.calibration.motion import MotionSegment, node_starts
 from terrafusion.fusion.calibration.numbers import Knowledge, assumed
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.calibration.reduction import Noise
@@ -23,7 +23,7 @@ PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03, slip_time_s=ASSUME
 
 def drive(
     time_s: float, spread: float, seed: int, fix_sigma_m: float = 0.01, seconds: float = 600.0
-) -> Drive:
+) -> MotionSegment:
     """Winding at 1 m/s, with slip as a Gauss-Markov process."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, STEP_S)
@@ -40,10 +40,10 @@ def drive(
     fix = fix + fix_sigma_m * (rng.normal(size=len(fix)) + 1j * rng.normal(size=len(fix)))
     distance = STEP_S / (1.0 + slip)
     sigma = np.full(len(fix), fix_sigma_m)
-    return Drive(t, distance, turn, stamps, fix, sigma, 0j, node_starts(t, distance, fix_sigma_m))
+    return MotionSegment(t, distance, turn, stamps, fix, sigma, 0j, node_starts(t, distance, fix_sigma_m))
 
 
-def learned(given: Drive) -> Knowledge:
+def learned(given: MotionSegment) -> Knowledge:
     return driven(given, SelfCalibration(PRIOR, NOISE, 0j))[-1]
 
 

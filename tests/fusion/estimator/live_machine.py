@@ -195,7 +195,7 @@ class LiveMachine(RuleBasedStateMachine):
         assert (np.diag(state.covariance) > 0.0).all()
 
     def teardown(self) -> None:
-        """Valid messages work again: at once, or, where stamps agreed that time has leapt, from there on."""
+        """Valid messages work again: at once, or, where stamps agreed that time has jumped, from there on."""
         if self.ahead >= 3:
             self.shift_ns += max(0, self.newest_ns - self.now_ns()) + 20 * SECOND_NS
             self.state_ns = min(self.state_ns, self.now_ns())

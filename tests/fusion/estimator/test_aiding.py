@@ -22,9 +22,9 @@ from terrafusion.fusion.estimator.magnetometer import (
     PATIENCE,
     FieldReference,
     MagnetometerAiding,
+    heading_factor,
     levelled,
     wrapped,
-    yaw_factor,
     yaw_jacobian,
     yaw_of,
 )
@@ -156,7 +156,7 @@ def test_the_factors_say_height_and_heading_and_nothing_else(
         J.T @ J, np.outer(height_jacobian(R, lever), height_jacobian(R, lever)) / 0.25, atol=1e-8
     )
     np.testing.assert_allclose(J.T @ b, height_jacobian(R, lever) * wanted / 0.25, atol=1e-6)
-    J, b = linear(yaw_factor(0, R, turn, 0.1), pose)
+    J, b = linear(heading_factor(0, R, turn, 0.1), pose)
     vertical = np.append(R[2], np.zeros(3))  # a turn about the world's vertical, in body axes
     assert vertical @ J.T @ J @ vertical == pytest.approx(math.cos(turn) ** 2 / 0.01, rel=1e-6)
     assert vertical @ J.T @ b == pytest.approx(math.cos(turn) * math.sin(turn) / 0.01, rel=1e-6, abs=1e-9)

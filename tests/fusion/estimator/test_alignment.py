@@ -17,7 +17,7 @@ from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.alignment import Start, heading_from_motion, level_start
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.inputs.door import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

@@ -135,7 +135,7 @@ def test_with_fixes_none_is_refused_for_the_wheels(ice: Recording) -> None:
     found = replay(ice)
     assert found.rejected_gnss <= 3
     assert rms_m(found) < 0.25
-    assert any("the robot slid, with a friction limit of" in note for note in found.estimate.notes)
+    assert any("the robot skidded, with a friction limit of" in note for note in found.estimate.notes)
 
 
 def test_ground_that_holds_costs_nothing(asphalt: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,8 +21,8 @@ from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE
-from terrafusion.fusion.inputs.door import checked_fix
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.validation import checked_fix
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

@@ -11,7 +11,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_VELOCITY_SIGMA_MPS
 from terrafusion.fusion.api.replays import replay
-from terrafusion.fusion.inputs.door import checked_fix
+from terrafusion.fusion.inputs.validation import checked_fix
 from tests.fusion.estimator.test_gnss import winding
 
 

@@ -22,13 +22,13 @@ from terrafusion.fusion.calibration.numbers import (
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import (
-    SLIDE_SEEN_NS,
+    SKID_DETECTION_NS,
     TURN_TIME_S,
     _doubt_place,
     with_turn_doubt,
 )
-from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
@@ -129,7 +129,7 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
     assert learned.calibration is not None
     assert learned._untouched(driving.chain, learned.calibration) is learned.calibration.before
     sure, late = (dataclasses.replace(learned.calibration.before, slip_spread=s) for s in (0.01, 0.02))
-    learned._past.extend([(now_ns - SLIDE_SEEN_NS, sure), (now_ns, late)])
+    learned._past.extend([(now_ns - SKID_DETECTION_NS, sure), (now_ns, late)])
     assert learned._untouched(driving.chain, learned.calibration) is sure
 
 

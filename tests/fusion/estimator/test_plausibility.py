@@ -28,8 +28,8 @@ from terrafusion.fusion.estimator.plausibility import (
     within_reach,
 )
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
-from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

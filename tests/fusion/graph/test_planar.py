@@ -313,11 +313,11 @@ def test_the_link_goes_round_a_circle_and_comes_back() -> None:
 @pytest.mark.parametrize("rate_radps", [-0.7, 0.0, 0.7])
 def test_yaw_noise_by_source(rate_radps: float) -> None:
     spec = load_vehicle("elevate").rig().sensors.imu
-    gyro, wheels, nobody = (PlanarPreintegrator(spec, who) for who in ("gyro", "wheels", "nobody"))
+    gyro, wheels, none = (PlanarPreintegrator(spec, who) for who in ("gyro", "wheels", "none"))
     assert gyro.yaw_density(rate_radps, 2.0) == pytest.approx(2.0 * spec.gyro_noise_radps_sqrthz)
     assert wheels.yaw_density(rate_radps, 2.0) == wheels.yaw_density(-rate_radps, 1.0)
     assert wheels.yaw_density(rate_radps, 1.0) >= wheels.yaw_density(0.0, 1.0) > gyro.yaw_density(0.0, 1.0)
-    assert nobody.yaw_density(0.0, 1.0) > wheels.yaw_density(0.0, 1.0)
+    assert none.yaw_density(0.0, 1.0) > wheels.yaw_density(0.0, 1.0)
 
 
 @pytest.mark.parametrize("what", [*REDUCED, "gyro z and body speed"])

@@ -24,7 +24,7 @@ MOST_MPS, MOST_TRAVEL_M = 100.0, 1e9
 MOST_AWAY_M, MOST_HEIGHT_M = 2e7, 1e5
 """Half the circumference of the earth; heights are below the stratosphere."""
 _FLOAT = np.dtype(float)
-LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
+LEAST_REPORTED_SIGMA_M, MOST_REPORTED_SIGMA_M = 1e-3, 1e3
 """Reported sigmas outside this range are replaced by that of the class of fix; without a class the smaller
 ones are raised to it."""
 
@@ -169,7 +169,7 @@ def _sigma_of(sigma_m: ArrayLike | None, known: Fix | None) -> Array | None:
             remedy="give metres, 1 sigma, for east, north and up",
         )  # fmt: skip
     level = sigma[:2].tolist()
-    sensible = all(LEAST_CLAIM_M <= one <= MOST_CLAIM_M for one in level)
+    sensible = all(LEAST_REPORTED_SIGMA_M <= one <= MOST_REPORTED_SIGMA_M for one in level)
     if not sensible and known is not None:
         sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
     elif not all(0.0 < one < math.inf for one in level):
@@ -177,10 +177,10 @@ def _sigma_of(sigma_m: ArrayLike | None, known: Fix | None) -> Array | None:
             f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
         )
     elif not sensible:
-        if beyond(sigma[:2], MOST_CLAIM_M):
+        if beyond(sigma[:2], MOST_REPORTED_SIGMA_M):
             return None
-        sigma[:2] = np.maximum(sigma[:2], LEAST_CLAIM_M)
-    sigma[2] = max(sigma[2], LEAST_CLAIM_M) if 0.0 < sigma[2] <= MOST_HEIGHT_M else np.nan
+        sigma[:2] = np.maximum(sigma[:2], LEAST_REPORTED_SIGMA_M)
+    sigma[2] = max(sigma[2], LEAST_REPORTED_SIGMA_M) if 0.0 < sigma[2] <= MOST_HEIGHT_M else np.nan
     return sigma
 
 

@@ -17,9 +17,9 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import GnssSample, ImuSample, Message, WheelSample
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.notes import notes_of
-from terrafusion.fusion.inputs.door import checked_fix, checked_time
-from terrafusion.fusion.inputs.leaps import Leap, Newest
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.time_jumps import Newest, TimeJump
+from terrafusion.fusion.inputs.validation import checked_fix, checked_time
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
 
@@ -118,8 +118,8 @@ def test_a_clock_that_leaps_for_a_while_is_not_followed_while_the_other_goes_on(
 ) -> None:
     estimator, until_ns = running.again(), running.now_ns + 10**9
     for message in running.rest:
-        leaps = isinstance(message, kind) and message.t_ns < until_ns
-        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if leaps else message)
+        jumps = isinstance(message, kind) and message.t_ns < until_ns
+        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if jumps else message)
     state = estimator.latest()
     assert state is not None
     assert abs(state.t_ns - running.rest[-1].t_ns) < 10**9
@@ -135,8 +135,8 @@ def test_clocks_that_leap_together_are_not_followed_while_the_fixes_go_on(
     """As after a step of the clock of the computer: for a second, or for good."""
     estimator, until_ns = running.again(), running.now_ns + (10**9 if back else HOUR_NS)
     for message in running.rest:
-        leaps = isinstance(message, (ImuSample, WheelSample)) and message.t_ns < until_ns
-        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if leaps else message)
+        jumps = isinstance(message, (ImuSample, WheelSample)) and message.t_ns < until_ns
+        estimator.add(message._replace(t_ns=message.t_ns + ahead_ns) if jumps else message)
     state = estimator.latest()
     assert state is not None
     if back:
@@ -150,9 +150,9 @@ def test_clocks_that_stay_ahead_of_the_fixes_are_an_error(running: Running) -> N
     estimator, refused = running.again(), []
     for i, (message, again) in enumerate([(m, k) for k in range(4) for m in running.rest]):
         later_ns = again * (running.rest[-1].t_ns - running.now_ns)
-        leaps = isinstance(message, (ImuSample, WheelSample))
+        jumps = isinstance(message, (ImuSample, WheelSample))
         try:
-            estimator.add(message._replace(t_ns=message.t_ns + later_ns + leaps * HOUR_NS))
+            estimator.add(message._replace(t_ns=message.t_ns + later_ns + jumps * HOUR_NS))
         except DataError as error:
             refused.append((i, str(error)))
     assert refused
@@ -160,13 +160,13 @@ def test_clocks_that_stay_ahead_of_the_fixes_are_an_error(running: Running) -> N
     assert re.search(r"360\d\.\d s ahead of the fixes, .* start anew", refused[0][1])
 
 
-@pytest.mark.parametrize("fixes", ["leap, too", "are missing"])
+@pytest.mark.parametrize("fixes", ["jump, too", "are missing"])
 def test_clocks_that_leap_together_are_followed_where_no_fix_contradicts(
     running: Running, fixes: str
 ) -> None:
     estimator = running.again()
     for message in running.rest:
-        if fixes == "leap, too" or not isinstance(message, GnssSample):
+        if fixes == "jump, too" or not isinstance(message, GnssSample):
             estimator.add(message._replace(t_ns=message.t_ns + HOUR_NS))
     state = estimator.latest()
     assert state is not None
@@ -212,13 +212,13 @@ def test_fixes_of_a_receiver_whose_clock_is_ahead_are_used(running: Running) -> 
 def test_a_wrong_stamp_among_the_first_opens_the_door_to_no_other(wrong: int) -> None:
     """Until some steps of time are known, any would do: one that is wrong would permit all after it."""
     wheels = WheelStream()
-    imu = ImuStream(newest=wheels.late.leap.newest)
+    imu = ImuStream(newest=wheels.late.jump.newest)
     for i in range(400):
         ahead_ns = 2_640_000_000 if i == wrong or i % 100 == 50 else 0
         imu.add(i * 10**7 + ahead_ns, np.zeros(3), G)
         if i % 2 == 0:
             wheels.add(i * 10**7, 1.0, 1.0)
-    assert imu.late.leap.dropped == 5
+    assert imu.late.jump.dropped == 5
     assert imu.t_ns == [i * 10**7 for i in range(400) if i != wrong and i % 100 != 50]
     assert len(wheels.t_ns) == 200
 
@@ -243,11 +243,11 @@ def test_one_sample_that_is_seconds_old_delays_nothing(running: Running) -> None
 
 def test_a_slow_stream_has_no_leaps() -> None:
     """Of samples 2 s apart, as of the only sensor of a log, none is lost, and few wait for another."""
-    leap = Leap(Newest())
-    admitted = [leap.admitted((i * 2 * 10**9,)) for i in range(30)]
+    jump = TimeJump(Newest())
+    admitted = [jump.admitted((i * 2 * 10**9,)) for i in range(30)]
     assert [len(some) for some in admitted[:4]] == [1, 0, 0, 3]
     assert sum(map(len, admitted)) == 30
-    assert leap.dropped == 0
+    assert jump.dropped == 0
 
 
 def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_it(running: Running) -> None:
@@ -276,23 +276,23 @@ def test_a_first_stamp_that_was_wrong_does_not_lock_a_stream(ahead_ns: int) -> N
         wheels.add(i * 10**8, 1.0, 1.0)
         imu.add(i * 10**8, np.zeros(3), G)
     assert wheels.t_ns == imu.t_ns == [i * 10**8 for i in range(5)]
-    assert wheels.late.leap.dropped == imu.late.leap.dropped == 1
+    assert wheels.late.jump.dropped == imu.late.jump.dropped == 1
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), max_size=40))
 def test_lone_leaps_are_dropped_and_a_pause_loses_nothing(pattern: list[tuple[int, bool]]) -> None:
     """Samples a tenth apart, of which some are an hour ahead, never three in a row."""
-    leap, admitted, t, in_a_row, lone = Leap(Newest()), [], 0, 0, 0
-    leap.admitted((0,))
+    jump, admitted, t, in_a_row, lone = TimeJump(Newest()), [], 0, 0, 0
+    jump.admitted((0,))
     for step, ahead in pattern:
         t += step * 10**8
         in_a_row = in_a_row + 1 if ahead and in_a_row < 2 else 0
         lone += in_a_row > 0
-        admitted += leap.admitted((t + HOUR_NS if in_a_row else t,))
-    admitted += leap.admitted((t,))
+        admitted += jump.admitted((t + HOUR_NS if in_a_row else t,))
+    admitted += jump.admitted((t,))
     assert all(one[0] < HOUR_NS for one in admitted)
-    assert leap.dropped == lone
-    resumed = [one for i in range(8) for one in leap.admitted((2 * HOUR_NS + i * 10**8,))]
+    assert jump.dropped == lone
+    resumed = [one for i in range(8) for one in jump.admitted((2 * HOUR_NS + i * 10**8,))]
     assert len(resumed) == 8
 
 

@@ -1,7 +1,7 @@
 """Stamps far ahead of all others: a clock that was wrong, or a pause of the log.
 
-A sample ahead is held until others confirm its time. Whether IMU and wheels that leap together have paused,
-or have a clock that is wrong, the fixes tell where they go on.
+A sample ahead is held until others confirm its time. If IMU and wheel stamps jump together, the next fixes
+decide between a pause and a wrong clock.
 """
 
 import itertools
@@ -10,18 +10,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.inputs.door import GnssFix, checked_time
+from terrafusion.fusion.inputs.validation import GnssFix, checked_time
 
-LEAP_NS, LONGEST_LEAP_NS, LEAP_STEPS = 1_000_000_000, 10_000_000_000, 10
+JUMP_NS, LONGEST_JUMP_NS, JUMP_STEPS = 1_000_000_000, 10_000_000_000, 10
 """A sample this much newer than all others, and by so many of the steps before, is no next sample, unless
 others confirm its time; beyond the longest always."""
 STEPS_SEEN = 8
 CONFIRMED, CONFIRMED_NS = 3, 500_000_000
-"""Samples that show that time has leapt, and the time that they must span: in it another stream that goes on
+"""Samples that show that time has jumped, and the time that they must span: in it another stream that goes on
 would have shown that it has not."""
 FIX_STEPS, LONGEST_FIX_WAIT_NS = 2, 5_000_000_000
-"""Intervals of the fixes within which they show whether time has leapt; a receiver that is slower has no
-say (assumed)."""
+"""Intervals of the fixes within which they show whether time has jumped; a slower receiver has no say
+(assumed)."""
 LONGEST_REFUTED_NS = 5_000_000_000
 """A clock that has gone ahead of the fixes for so long does not return (assumed)."""
 
@@ -33,45 +33,45 @@ class Newest:
     Attributes:
         refused: by channel, the number of samples far ahead of it.
         steps_ns: the last steps of time.
-        taken: number of samples that are used.
-        fixes_ns: times of the last fixes, as they came; `fixed` counts all.
+        used_count: number of samples that are used.
+        fixes_ns: times of the last fixes, as they came; `fix_count` counts all.
     """
 
     t_ns: int | None = None
     refused: dict[str, int] = field(default_factory=dict)
     steps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
-    taken: int = 0
+    used_count: int = 0
     fixes_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
-    fixed: int = 0
+    fix_count: int = 0
 
     def advance(self, t_ns: int) -> None:
         """Take the time of a sample that is used."""
-        self.taken += 1
+        self.used_count += 1
         if self.t_ns is None or t_ns > self.t_ns:
             if self.t_ns is not None:
                 self.steps_ns.append(t_ns - self.t_ns)
             self.t_ns = t_ns
 
-    def leaps(self, t_ns: int) -> bool:
+    def is_jump(self, t_ns: int) -> bool:
         """Whether a time lies far ahead of all samples."""
-        if self.t_ns is None or t_ns - self.t_ns <= LEAP_NS:
+        if self.t_ns is None or t_ns - self.t_ns <= JUMP_NS:
             return False
         # Of the first steps one that was wrong would permit any that follow.
-        return len(self.steps_ns) < STEPS_SEEN or t_ns - self.t_ns > self.leap_ns()
+        return len(self.steps_ns) < STEPS_SEEN or t_ns - self.t_ns > self.jump_ns()
 
-    def leap_ns(self) -> int:
-        """Step of time that is a leap, by the largest step but one: one may have been a leap itself."""
+    def jump_ns(self) -> int:
+        """Step of time that is a jump, by the largest step but one: one may have been a jump itself."""
         if len(self.steps_ns) < STEPS_SEEN:
-            return LONGEST_LEAP_NS
-        return min(max(LEAP_NS, LEAP_STEPS * sorted(self.steps_ns)[-2]), LONGEST_LEAP_NS)
+            return LONGEST_JUMP_NS
+        return min(max(JUMP_NS, JUMP_STEPS * sorted(self.steps_ns)[-2]), LONGEST_JUMP_NS)
 
     def fix(self, t_ns: int) -> None:
         """Take the time of a fix, whether it is used or not."""
         self.fixes_ns.append(t_ns)
-        self.fixed += 1
+        self.fix_count += 1
 
     def fix_wait_ns(self) -> int:
-        """Time within which another fix shows whether time has leapt; 0 where it does not."""
+        """Time within which another fix shows whether time has jumped; 0 where it does not."""
         usual = sorted(b - a for a, b in itertools.pairwise(self.fixes_ns))
         wait_ns = FIX_STEPS * usual[len(usual) // 2] if len(usual) > 1 else 0
         return wait_ns if 0 < wait_ns <= LONGEST_FIX_WAIT_NS else 0
@@ -83,20 +83,20 @@ class Newest:
             DataError: the time is none.
         """
         t_ns = checked_time(t_ns, channel)
-        if self.t_ns is None or t_ns - self.t_ns <= LONGEST_LEAP_NS:
+        if self.t_ns is None or t_ns - self.t_ns <= LONGEST_JUMP_NS:
             return t_ns
         self.refused[channel] = self.refused.get(channel, 0) + 1
         return None
 
 
 @dataclass
-class Leap:
+class TimeJump:
     """Samples far ahead of all others; they distinguish a clock that was wrong from a pause of the log.
 
     Attributes:
         newest: of all streams.
         held: samples ahead, each beginning with its time.
-        taken, fixed: samples that had been used, and fixes that had come, when the first of `held` came.
+        used_count, fix_count: samples used and fixes that had come when the first of `held` came.
         dropped: number of samples whose time no other confirmed, or another stream contradicted.
         refuted_ns: time of the first sample in a row that fixes contradict.
     """
@@ -104,39 +104,39 @@ class Leap:
     newest: Newest
     channel: str = "imu"
     held: list[tuple[Any, ...]] = field(default_factory=list)
-    taken: int = 0
-    fixed: int = 0
+    used_count: int = 0
+    fix_count: int = 0
     dropped: int = 0
     refuted_ns: int | None = None
 
     def admitted(self, sample: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-        """The samples to use now: this one, none while it leaps ahead, or all held once they agree.
+        """The samples to use now: this one, none while it is far ahead, or all held once they agree.
 
         Raises:
             DataError: for seconds they have been ahead of fixes that go on as before.
         """
         t_ns, before, newest = sample[0], [], self.newest
-        if not self.held and newest.t_ns is not None and t_ns - newest.t_ns <= LEAP_NS:  # as most are
+        if not self.held and newest.t_ns is not None and t_ns - newest.t_ns <= JUMP_NS:  # as most are
             self.refuted_ns = None
             newest.advance(t_ns)
             return [sample]
-        if self.held and not self.newest.leaps(self.held[-1][0]):  # another stream has confirmed them
+        if self.held and not self.newest.is_jump(self.held[-1][0]):  # another stream has confirmed them
             before = self.held[:]
             self.held.clear()
         refuted = self._fixes_go_on()
         if self.held and not (
-            self.newest.leaps(t_ns)
-            and abs(t_ns - self.held[-1][0]) <= self.newest.leap_ns()
-            and self.newest.taken == self.taken  # else another stream goes on as before
+            self.newest.is_jump(t_ns)
+            and abs(t_ns - self.held[-1][0]) <= self.newest.jump_ns()
+            and self.newest.used_count == self.used_count  # else another stream goes on as before
             and not refuted
         ):
             self.dropped += len(self.held)
             self.held.clear()
         self._refuse_for_long(t_ns, refuted)
         samples = [*before, sample]
-        if self.newest.leaps(t_ns):
+        if self.newest.is_jump(t_ns):
             if not self.held:
-                self.taken, self.fixed = self.newest.taken, self.newest.fixed
+                self.used_count, self.fix_count = self.newest.used_count, self.newest.fix_count
             self.held.append(sample)
             if not self._is_confirmed(t_ns):
                 return []
@@ -150,19 +150,20 @@ class Leap:
         span_ns = abs(t_ns - self.held[0][0])
         if len(self.held) < CONFIRMED or span_ns < CONFIRMED_NS:
             return False
-        fixed = self.newest.fixed > self.fixed and self.newest.fixes_ns[-1] >= self.held[0][0] - LEAP_NS
-        return fixed or span_ns >= self.newest.fix_wait_ns()
+        newest, least_ns = self.newest, self.held[0][0] - JUMP_NS
+        by_fix = newest.fix_count > self.fix_count and newest.fixes_ns[-1] >= least_ns
+        return by_fix or span_ns >= newest.fix_wait_ns()
 
     def _fixes_go_on(self) -> bool:
-        """Whether a fix has come since that was measured after all other samples, and has not leapt."""
+        """Whether a fix has come since that was measured after all other samples, and has not jumped."""
         newest = self.newest
-        if not self.held or newest.fixed == self.fixed or newest.t_ns is None:
+        if not self.held or newest.fix_count == self.fix_count or newest.t_ns is None:
             return False
-        return newest.t_ns < newest.fixes_ns[-1] < self.held[0][0] - LEAP_NS
+        return newest.t_ns < newest.fixes_ns[-1] < self.held[0][0] - JUMP_NS
 
     def _refuse_for_long(self, t_ns: int, refuted: bool) -> None:
         """Raise where fixes have contradicted all samples for long."""
-        if not self.newest.leaps(t_ns):
+        if not self.newest.is_jump(t_ns):
             self.refuted_ns = None
         elif refuted and self.refuted_ns is None:
             self.refuted_ns = t_ns
@@ -177,7 +178,7 @@ class Leap:
 
 
 @dataclass
-class FixesAhead:
+class EarlyFixes:
     """Fixes that IMU and wheels are far from having reached: held until the next ones show their order.
 
     Attributes:
@@ -205,7 +206,7 @@ class FixesAhead:
             self.held.clear()
         fixes = [*self.held, (t_ns, fix)]
         now_ns = self.newest.t_ns
-        if now_ns is None or t_ns - now_ns <= LEAP_NS or len(fixes) >= CONFIRMED:
+        if now_ns is None or t_ns - now_ns <= JUMP_NS or len(fixes) >= CONFIRMED:
             self.held.clear()
             return fixes
         self.held = fixes
@@ -214,7 +215,7 @@ class FixesAhead:
     def reached(self) -> list[tuple[int, Any]]:
         """Those that IMU and wheels have nearly reached meanwhile."""
         now_ns = self.newest.t_ns
-        if not self.held or now_ns is None or self.held[0][0] - now_ns > LEAP_NS:
+        if not self.held or now_ns is None or self.held[0][0] - now_ns > JUMP_NS:
             return []
         fixes = self.held[:]
         self.held.clear()
