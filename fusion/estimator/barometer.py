@@ -8,7 +8,6 @@ The samples of a second count as one.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 
 import gtsam
@@ -19,7 +18,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa
 from terrafusion.datasets.core.sensors import BarometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
+from terrafusion.fusion.estimator.slow_bias import BiasedSensor, SlowBias
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, KeyState
 
@@ -31,9 +30,6 @@ MOST_AGE_NS = 3_000_000_000
 UNKNOWN_M = 1e4
 SCALE_SIGMA = 0.05
 """Relative error of a height difference: air within 15 K of the standard's (assumed)."""
-GATE_SIGMA = 4.0
-PATIENCE = 10
-"""Consecutive rejected seconds after which the pressure has jumped: a door, a hatch, a gust."""
 FREE_M = 1e5
 
 
@@ -50,22 +46,25 @@ def height_factor(k: int, height_m: float, sigma_m: float, sensor_m: Array) -> g
     return gtsam.GPSFactorArm(X(k), np.array([0.0, 0.0, height_m]), sensor_m, noise)
 
 
-class BarometerAiding:
-    """Turns pressures into factors of the newest keyframe; `report` gets every innovation (m)."""
+class BarometerAiding(BiasedSensor[float]):
+    """Turns pressures into factors of the newest keyframe; `report` gets every innovation (m).
+
+    After `PATIENCE` rejected seconds the pressure has jumped: a door, a hatch, a gust.
+    """
+
+    SENSOR, GATE_SIGMA, PATIENCE = "barometer", 4.0, 10
 
     def __init__(self, spec: BarometerSpec | None, report: Callable[[Innovation], None]) -> None:
+        super().__init__(report)
         self.spec = spec or GENERIC
         self.bias: SlowBias | None = None
-        self.used = self.refused = self.jumps = 0
-        self._samples: deque[tuple[int, float]] = deque()
+        self.jumps = 0
         self._mean = [0.0, 0.0]
         self._due_ns: int | None = None
         self._last_ns = 0
         self._datum_m = 0.0
         self._aligned = False
         self._slope = 0.0
-        self._refused_in_a_row = 0
-        self._on_innovation = report
 
     def add(self, t_ns: int, pressure_pa: float) -> None:
         """One pressure; impossible values are rejected."""
@@ -73,10 +72,6 @@ class BarometerAiding:
             self._samples.append((int(t_ns), float(pressure_pa)))
         else:
             self.refused += 1
-
-    def forget(self, before_ns: int) -> None:
-        """Drop the samples before a time."""
-        self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
 
     @property
     def active(self) -> bool:
@@ -94,8 +89,7 @@ class BarometerAiding:
         """
         if aligned and not self._aligned:
             self._aligned, self._mean, self._due_ns = True, [0.0, 0.0], None
-            if self.bias is not None:
-                self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
+            self._forget_offset()
         key = chain.state(chain.last)
         lever = np.array(self.spec.position_m)
         jacobian = height_jacobian(key.pose.rotation().matrix(), lever)
@@ -113,11 +107,7 @@ class BarometerAiding:
 
     def _gather(self, t_ns: int, newest_ns: int, height_m: float, key: KeyState) -> None:
         """Sums of pressure height less estimated height over the samples up to now."""
-        due, self._samples, impossible = split_by_time(self._samples, t_ns, newest_ns)
-        self.refused += impossible
-        for at_ns, pressure in due:
-            if t_ns - at_ns > MOST_AGE_NS:
-                continue
+        for at_ns, pressure in self._due(t_ns, newest_ns, MOST_AGE_NS):
             relative = height_m - float(key.velocity[2]) * (t_ns - at_ns) * 1e-9
             self._mean[0] += float(height_of(pressure)) - relative
             self._mean[1] += 1.0
@@ -138,14 +128,7 @@ class BarometerAiding:
         self._last_ns = t_ns
         H = np.array([1.0, height_m - self._datum_m])
         innovation = offset - float(H @ self.bias.mean)
-        nis = innovation**2 / self.bias.variance(H, variance, noise)
-        accepted = nis <= GATE_SIGMA**2
-        self._on_innovation(Innovation(t_ns, "barometer", np.array([innovation]), nis, 1, accepted))
-        if not accepted:
-            return self._refuse()
-        self._refused_in_a_row = 0
-        self.used += 1
-        relative = self.bias.measure(innovation, H, variance, noise)
+        relative = self._gated(self.bias, t_ns, innovation, H, variance, noise)
         if relative is None:
             return False
         lever = np.array(self.spec.position_m)
@@ -153,14 +136,13 @@ class BarometerAiding:
         chain.add(chain.last, factor, "X")
         return True
 
-    def _refuse(self) -> bool:
-        self.refused += 1
-        self._refused_in_a_row += 1
-        if self._refused_in_a_row >= PATIENCE and self.bias is not None:
+    def _has_jumped(self) -> None:
+        self._forget_offset()
+        self.jumps += 1
+
+    def _forget_offset(self) -> None:
+        if self.bias is not None:
             self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
-            self._refused_in_a_row = 0
-            self.jumps += 1
-        return False
 
     def note(self) -> str | None:
         """How many pressures were used and rejected, in a sentence."""

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.graph.key_state import yaw_of
+from terrafusion.fusion.inputs.validation import GnssFix
 
 KEPT_S = 30.0
 SCATTER_FIXES, LEAST_FIXES = 21, 8
@@ -142,7 +143,7 @@ class DeadReckoning:
         """Extend the path to the newest keyframe by its wheels, or its velocity where they are rejected."""
         node, state = chain.nodes[-1], chain.state(chain.last)
         R = state.rotation
-        self._yaw_chain = math.atan2(R[1, 0], R[0, 0])
+        self._yaw_chain = yaw_of(R)
         if not self._t_ns or len(chain.nodes) < 2:
             self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0, 0.0)
             return

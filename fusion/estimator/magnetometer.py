@@ -14,7 +14,6 @@ reset; after more than `CHANCES` resets the sensor is left out.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 
 import gtsam
@@ -27,9 +26,9 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import MagnetometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.alignment import WINDOW_NS, Start
-from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
+from terrafusion.fusion.estimator.slow_bias import BiasedSensor, SlowBias
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import POSE
+from terrafusion.fusion.graph.key_state import POSE, yaw_of
 
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
 """For a vehicle whose file has no magnetometer (assumed: calibrated once)."""
@@ -49,19 +48,12 @@ WALK = np.array([5e-4, 2e-8, 2e-8])
 SIZE_SHARE, DIP_RAD = 0.15, 0.15
 """Allowed differences of size (share) and dip (9 deg) from those of the run so far (assumed)."""
 FOLLOW_S = 60.0
-GATE_SIGMA = 3.5
-PATIENCE = 20
 CHANCES = 3
 LEAST_START = 5
 FREE_SIGMA = 1e3
 ASTRAY_SIGMA = 4.0
 ODD_SHARE = 0.1
 _NORTH_EAST = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0])
-
-
-def yaw_of(R: Array) -> float:
-    """Heading of the body's x axis, rad: 0 east, left positive."""
-    return math.atan2(R[1, 0], R[0, 0])
 
 
 def yaw_jacobian(R: Array) -> Array:
@@ -125,7 +117,7 @@ class FieldReference:
         self.size_t = 0.0
 
 
-class MagnetometerAiding:
+class MagnetometerAiding(BiasedSensor[Array]):
     """Turns fields into factors of the newest keyframe; `report` gets every innovation (rad).
 
     Args:
@@ -136,6 +128,8 @@ class MagnetometerAiding:
             hard iron.
     """
 
+    SENSOR, GATE_SIGMA, PATIENCE = "magnetometer", 3.5, 20
+
     def __init__(
         self,
         spec: MagnetometerSpec | None,
@@ -143,18 +137,16 @@ class MagnetometerAiding:
         report: Callable[[Innovation], None],
         tilt_rad: float = 0.0,
     ) -> None:
+        super().__init__(report)
         self.spec = spec or GENERIC
         self.declination_rad = declination_rad
         iron = [math.hypot(self.spec.hard_iron_sigma_t, tilt_rad * VERTICAL_T)] * 2
         sigma = UNKNOWN_RAD if declination_rad is None else DECLINATION_SIGMA_RAD
         self.bias = SlowBias.of(np.array([declination_rad or 0.0, 0.0, 0.0]), np.array([sigma, *iron]))
         self.reference = FieldReference()
-        self.used = self.refused = self.renewed = 0
-        self._samples: deque[tuple[int, Array]] = deque()
+        self.renewed = 0
         self._last_ns: int | None = None
-        self._refused_in_a_row = 0
         self._corrections = 0
-        self._on_innovation = report
 
     @property
     def disabled(self) -> bool:
@@ -168,10 +160,6 @@ class MagnetometerAiding:
             raise DataError(f"a field of shape {field.shape}", channel="magnetometer", remedy="give x, y, z")
         if not self.disabled and np.isfinite(field).all():
             self._samples.append((int(t_ns), field))
-
-    def forget(self, before_ns: int) -> None:
-        """Drop the samples before a time."""
-        self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
 
     @property
     def ready(self) -> bool:
@@ -187,7 +175,7 @@ class MagnetometerAiding:
         """The frame is local: its heading is unrelated to north, whatever declination was given."""
         if self.declination_rad is not None:
             self.declination_rad = None
-            self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
+            self._forget_heading()
 
     def stationary_heading(self, level: Start, tilt_rad: float) -> tuple[float, float] | None:
         """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known to `tilt_rad`.
@@ -230,8 +218,8 @@ class MagnetometerAiding:
         self.bias.state_updated(before_rad2, after_rad2)
         if corrections != self._corrections:
             self._corrections = corrections
-            self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
-        recent = self._recent(t_ns, newest_ns)
+            self._forget_heading()
+        recent = [field for _, field in self._due(t_ns, newest_ns, AVERAGING_NS)]
         if not recent or (self._last_ns is not None and t_ns - self._last_ns < INTERVAL_NS):
             return False
         elapsed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
@@ -240,28 +228,17 @@ class MagnetometerAiding:
         tilt = math.sqrt(0.5 * float(after[0, 0] + after[1, 1]))
         return self._measure(chain, t_ns, R, np.mean(recent, axis=0), len(recent), after_rad2, tilt)
 
-    def _recent(self, t_ns: int, newest_ns: int) -> list[Array]:
-        due, self._samples, impossible = split_by_time(self._samples, t_ns, newest_ns)
-        self.refused += impossible
-        return [field for at_ns, field in due if t_ns - at_ns <= AVERAGING_NS]
-
     def _measure(
         self, chain: Chain, t_ns: int, R: Array, field: Array, count: int, variance: float, tilt: float
     ) -> bool:
         flat = levelled(R) @ field
         if not self.reference.accepts(t_ns, flat):
-            return self._refuse()
+            self._refuse()
+            return False
         heading, H = self._heading_of_field(R, field)
         innovation = wrapped(heading - yaw_of(R))
         noise = self._noise(flat, count, tilt)
-        nis = innovation**2 / self.bias.variance(H, variance, noise)
-        accepted = nis <= GATE_SIGMA**2
-        self._on_innovation(Innovation(t_ns, "magnetometer", np.array([innovation]), nis, 1, accepted))
-        if not accepted:
-            return self._refuse()
-        self._refused_in_a_row = 0
-        self.used += 1
-        own = self.bias.measure(innovation, H, variance, noise)
+        own = self._gated(self.bias, t_ns, innovation, H, variance, noise)
         if own is None:
             return False
         chain.add(chain.last, heading_factor(chain.last, R, own.innovation, own.sigma), "X")
@@ -285,17 +262,15 @@ class MagnetometerAiding:
         dip = float(flat[2]) / across
         return self.spec.noise_t**2 / across**2 / count + SITE_SIGMA_RAD**2 + (dip * tilt_rad) ** 2
 
-    def _refuse(self) -> bool:
-        self.refused += 1
-        self._refused_in_a_row += 1
-        if self._refused_in_a_row >= PATIENCE:
-            self._refused_in_a_row = 0
-            self.renewed += 1
-            self.reference.forget()
-            self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
-            if self.disabled:
-                self._samples.clear()
-        return False
+    def _has_jumped(self) -> None:
+        self.renewed += 1
+        self.reference.forget()
+        self._forget_heading()
+        if self.disabled:
+            self._samples.clear()
+
+    def _forget_heading(self) -> None:
+        self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
 
     def notes(self) -> list[str]:
         """How many headings were used and rejected, and why, in sentences."""

@@ -18,14 +18,16 @@ Schmidt's filter leaves considered parameters); motion adds to P_s alone.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.estimate.estimate import Innovation
 
 T = TypeVar("T")
 
@@ -115,3 +117,53 @@ class SlowBias:
             return None
         own = max(state * state * S / (a * a) - state, 1e-6 * state)
         return Independent(innovation * state / a, float(np.sqrt(own)))
+
+
+class BiasedSensor(Generic[T]):
+    """Samples (time, value) of a sensor with a slow bias, and the gate of its measurements.
+
+    A measurement is used up to `GATE_SIGMA`; after `PATIENCE` rejected in a row the bias has jumped.
+    """
+
+    SENSOR, GATE_SIGMA, PATIENCE = "", math.inf, 1
+
+    def __init__(self, report: Callable[[Innovation], None]) -> None:
+        self.used = self.refused = 0
+        self._samples: deque[tuple[int, T]] = deque()
+        self._refused_in_a_row = 0
+        self._on_innovation = report
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a time."""
+        self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
+
+    def _due(self, t_ns: int, newest_ns: int, most_age_ns: int) -> list[tuple[int, T]]:
+        """Take the samples up to `t_ns`, and give those that are not too old."""
+        due, self._samples, impossible = split_by_time(self._samples, t_ns, newest_ns)
+        self.refused += impossible
+        return [sample for sample in due if t_ns - sample[0] <= most_age_ns]
+
+    def _gated(
+        self, bias: SlowBias, t_ns: int, innovation: float, H: Array, state: float, noise: float
+    ) -> Independent | None:
+        """What a measurement says of s alone; None where it is rejected or says almost nothing."""
+        nis = innovation**2 / bias.variance(H, state, noise)
+        accepted = nis <= self.GATE_SIGMA**2
+        self._on_innovation(Innovation(t_ns, self.SENSOR, np.array([innovation]), nis, 1, accepted))
+        if not accepted:
+            self._refuse()
+            return None
+        self._refused_in_a_row = 0
+        self.used += 1
+        return bias.measure(innovation, H, state, noise)
+
+    def _refuse(self) -> None:
+        self.refused += 1
+        self._refused_in_a_row += 1
+        if self._refused_in_a_row >= self.PATIENCE:
+            self._refused_in_a_row = 0
+            self._has_jumped()
+
+    def _has_jumped(self) -> None:
+        """Forget the bias."""
+        raise NotImplementedError

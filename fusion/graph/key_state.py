@@ -1,6 +1,7 @@
 """The state of one keyframe and its tangent space."""
 
 import functools
+import math
 from dataclasses import dataclass
 
 import gtsam
@@ -173,6 +174,11 @@ def skew(v: Array) -> Array:
     """The matrix (3, 3) with skew(v) @ u = v x u."""
     x, y, z = v.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def yaw_of(R: Array) -> float:
+    """Heading of the body's x axis, rad: 0 east, left positive."""
+    return math.atan2(R[1, 0], R[0, 0])
 
 
 def quaternion_of(pose: gtsam.Pose3) -> Array:

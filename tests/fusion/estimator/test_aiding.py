@@ -19,16 +19,15 @@ from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.barometer import BarometerAiding, height_factor, height_jacobian
 from terrafusion.fusion.estimator.magnetometer import (
     CHANCES,
-    PATIENCE,
     FieldReference,
     MagnetometerAiding,
     heading_factor,
     levelled,
     wrapped,
     yaw_jacobian,
-    yaw_of,
 )
 from terrafusion.fusion.estimator.slow_bias import MOST_AHEAD_NS, SlowBias, split_by_time
+from terrafusion.fusion.graph.key_state import yaw_of
 
 ANGLES = st.floats(-3.1, 3.1)
 TILTS = st.floats(-0.5, 0.5)
@@ -278,7 +277,7 @@ def test_pressures_that_are_none_are_refused() -> None:
 
 def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
     aid = MagnetometerAiding(None, None, lambda _: None)
-    for _ in range((CHANCES + 1) * PATIENCE):
+    for _ in range((CHANCES + 1) * MagnetometerAiding.PATIENCE):
         aid._refuse()
     assert aid.disabled
     aid.add(0, np.array([0.0, 19e-6, -45e-6]))
