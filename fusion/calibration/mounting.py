@@ -38,6 +38,8 @@ LEAST_SIGMA_RAD = math.radians(1.0)
 SQUARE_SHARE, SQUARE_SIGMA_RAD = 0.8, math.radians(2.0)
 """Share of IMUs whose axes are those of the body or turned by right angles, and 1 sigma of these; others are
 turned by any angle (assumed)."""
+STILL_CLEAR = 0.5
+"""A correction ends at this share of the limits at which it begins (assumed)."""
 PLACE_M = 0.5
 """1 sigma of the place of the IMU, each axis: it is somewhere on a robot (assumed)."""
 JOINT = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 1.0]])
@@ -56,6 +58,19 @@ class Angle:
         share = self.sigma_rad**2 / (self.sigma_rad**2 + other.sigma_rad**2)
         rad = self.rad + share * math.remainder(other.rad - self.rad, math.tau)
         return Angle(math.remainder(rad, math.tau), other.sigma_rad * math.sqrt(share))
+
+    def corrected(
+        self, found: Angle, corrects: bool, clear_sigma: float, least_rad: float
+    ) -> tuple[Angle, bool]:
+        """`found` and True where it clearly differs, else this angle, its sigma with the difference.
+
+        Clear is a difference of `clear_sigma` and `least_rad`; `STILL_CLEAR` of both once it `corrects`.
+        """
+        off = abs(math.remainder(found.rad - self.rad, math.tau))
+        limit = max(clear_sigma * found.sigma_rad, least_rad)
+        if off > (STILL_CLEAR * limit if corrects else limit):
+            return found, True
+        return Angle(self.rad, min(math.hypot(off, found.sigma_rad), self.sigma_rad)), False
 
     def as_mounted(self) -> Angle:
         """Mean and 1 sigma given that most IMUs are mounted at right angles, where nothing else is known.

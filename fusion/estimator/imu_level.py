@@ -24,9 +24,8 @@ LEVEL = ("imu_roll_rad", "imu_pitch_rad")
 """The two angles by their names in the vehicle file."""
 ASSUMED_SIGMA_RAD = 0.1
 """1 sigma of the tilt of an IMU of which nothing is known (assumed)."""
-CLEAR_SIGMA, LEAST_RAD, STILL_CLEAR = 4.0, math.radians(1.5), 0.5
-"""A correction begins at so many sigma from what was known and no less than this angle, and ends at half of
-both (assumed)."""
+CLEAR_SIGMA, LEAST_RAD = 4.0, math.radians(1.5)
+"""A correction begins at so many sigma from what was known and no less than this angle (assumed)."""
 LEAST_STEP_RAD = math.radians(0.5)
 """What is in use changes by no less."""
 AHEAD_KNOWN_RAD = 0.2
@@ -108,8 +107,8 @@ class ImuLevel:
         gyro_radps: Array,
         accel_mps2: Array,
         yaw_sigma_rad: float,
-    ) -> bool:
-        """Take the motion over `dt_s` up to the newest keyframe; True when states were turned.
+    ) -> None:
+        """Take the motion over `dt_s` up to the newest keyframe.
 
         Args:
             rolled_m: mean distance of the wheels.
@@ -117,24 +116,24 @@ class ImuLevel:
             yaw_sigma_rad: 1 sigma of the angle of the IMU about z.
         """
         if self._held:
-            return False
+            return
         state = chain.state(chain.last)
         back = self._back(self._imu.mounting_rad)
         if back is not None:
             gyro_radps, accel_mps2 = back @ gyro_radps, back @ accel_mps2
         self._new |= self._seen.add(dt_s, rolled_m * state.rolling / dt_s, gyro_radps, accel_mps2)
         if not self._new:
-            return False
+            return
         self._new, yaw = False, self._imu.mounting_rad
         was, used = complex(*self._angles()), []
         for i, (before, off) in enumerate(zip(self.before, self._found(yaw, yaw_sigma_rad), strict=True)):
             found = before.combined(Angle(before.rad + off.rad, off.sigma_rad))
-            used.append(self._in_use(i, before, found))
+            angle, self.corrects[i] = before.corrected(found, self.corrects[i], CLEAR_SIGMA, LEAST_RAD)
+            used.append(angle)
         self.known = used[0], used[1]
-        if abs(complex(*self._angles()) - was) < LEAST_STEP_RAD:
-            return False
-        self._turn(chain, yaw, abs(complex(*self._angles()) - was))
-        return True
+        step_rad = abs(complex(*self._angles()) - was)
+        if step_rad >= LEAST_STEP_RAD:
+            self._turn(chain, yaw, step_rad)
 
     def _back(self, yaw_rad: float) -> Array | None:
         """Rotation (3, 3) of readings levelled by what is known now to those levelled by what was
@@ -159,15 +158,6 @@ class ImuLevel:
             math.hypot(s * roll.sigma_rad, c * pitch.sigma_rad),
         )
         return Angle(off.real, sigma[0]), Angle(off.imag, sigma[1])
-
-    def _in_use(self, i: int, before: Angle, found: Angle) -> Angle:
-        """What was found where that is clear, else what was known before, its sigma with the difference."""
-        off = abs(found.rad - before.rad)
-        limit = max(CLEAR_SIGMA * found.sigma_rad, LEAST_RAD)
-        self.corrects[i] = off > (STILL_CLEAR * limit if self.corrects[i] else limit)
-        if self.corrects[i]:
-            return found
-        return Angle(before.rad, min(math.hypot(off, found.sigma_rad), before.sigma_rad))
 
     def _turn(self, chain: Chain, yaw_rad: float, step_rad: float) -> None:
         """Level the samples anew, and turn the newest state with them.

@@ -19,9 +19,9 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
 from terrafusion.fusion.inputs.streams import ImuStream, turned
 
-CLEAR_SIGMA, LEAST_RAD, STILL_CLEAR = 5.0, math.radians(5.0), 0.5
+CLEAR_SIGMA, LEAST_RAD = 5.0, math.radians(5.0)
 """A correction begins at so many sigma from what was known and no less than an angle that the noise of the
-accelerations hides; it ends at half of both (assumed)."""
+accelerations hides (assumed)."""
 
 DOUBTFUL_TILT_RAD, DOUBTFUL_MPS = 0.1, 0.3
 """1 sigma of tilt and speed after driving with turned accelerations (assumed)."""
@@ -62,44 +62,32 @@ class ImuMounting:
 
     def keyframe(
         self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
-    ) -> bool:
+    ) -> None:
         """Take the motion over `dt_s` up to the newest keyframe, by the wheels and the mean readings (3,) of
-        the IMU; True when a correction put states in doubt.
+        the IMU.
         """
-        friction = self._skid.friction
         if not self.learns:
-            return False
-        if rolled_m is None or (friction is not None and friction.leads):
+            return
+        if rolled_m is None:
             self._seen.interrupt()
             self.level.interrupt()
-            return False
-        levelled = self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2, self.known.sigma_rad)
+            return
+        self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2, self.known.sigma_rad)
         bias = chain.state(chain.last).bias
         turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
         raw = turned(accel_mps2, -self._imu.mounting_rad) if self._imu.mounting_rad else accel_mps2
         if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
-            return levelled
-        was_rad = self._imu.mounting_rad
-        seen = self._seen.angle
+            return
+        was_rad, seen = self._imu.mounting_rad, self._seen.angle
         found = seen.as_mounted() if self.before.sigma_rad == ANY_ANGLE_RAD else self.before.combined(seen)
-        self.known = self._in_use(found, chain.nodes[-1].t_ns)
+        self.known, clear = self.before.corrected(found, self.corrects, CLEAR_SIGMA, LEAST_RAD)
+        self.corrects_since_ns = (self.corrects_since_ns or chain.nodes[-1].t_ns) if clear else None
         self._imu.mounting_rad = self.known.rad
         if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
-            return levelled
+            return
         self.level.restart()
         self._skid.restart()
         chain.restart(self._doubt(chain.dim, bias.vector()))
-        return True
-
-    def _in_use(self, found: Angle, now_ns: int) -> Angle:
-        """What was found where that is clear, else what was known before, its sigma with the difference."""
-        off = abs(math.remainder(found.rad - self.before.rad, math.tau))
-        limit = max(CLEAR_SIGMA * found.sigma_rad, LEAST_RAD)
-        if off > (STILL_CLEAR * limit if self.corrects else limit):
-            self.corrects_since_ns = self.corrects_since_ns or now_ns
-            return found
-        self.corrects_since_ns = None
-        return Angle(self.before.rad, min(math.hypot(off, found.sigma_rad), self.before.sigma_rad))
 
     def _doubt(self, dim: int, bias: Array) -> Array:
         """Variances (dim,) of what turned accelerations have bent."""
