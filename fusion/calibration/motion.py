@@ -51,17 +51,6 @@ def node_due(apart_s: float, rolled_m: float, fix_sigma_m: float) -> bool:
     return (apart_s >= LEAST_NODE_S and rolled_m >= long_m) or apart_s >= LONGEST_NODE_S
 
 
-def node_starts(t_s: Array, distance_m: Array, fix_sigma_m: float) -> NDArray[np.intp]:
-    """Samples at which a node begins, from times (N + 1,) and distances (N,)."""
-    rolled = np.concatenate([[0.0], np.cumsum(np.abs(distance_m))])
-    found = [0]
-    for i in range(1, len(t_s) - 1):
-        last = found[-1]
-        if node_due(float(t_s[i] - t_s[last]), float(rolled[i] - rolled[last]), fix_sigma_m):
-            found.append(i)
-    return np.array(found)
-
-
 @dataclass(frozen=True, eq=False)
 class Path:
     """Dead reckoning of a drive with given numbers, and its derivatives by them.

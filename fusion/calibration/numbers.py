@@ -37,7 +37,7 @@ GYRO_SCALE_SIGMA, SKID_TURN_SIGMA, ROLL_TURN_SIGMA = 0.015, 0.35, 0.15
 """Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), that
 of wheels that skid in a turn about its usual value (0.44 to 0.71 measured), and of wheels that roll (assumed:
 what the file says of track, wheelbase and radii)."""
-BIAS_SIGMA_RADPS = 0.005
+LEAST_BIAS_SIGMA_RADPS = 0.005
 """Least prior of the gyro's bias: data sheets give it at one temperature."""
 WHEEL_SCALE_SIGMA = 0.05
 """Tyre pressure, wear, a nominal radius, and the mean slip of the ground (assumed)."""
@@ -92,6 +92,12 @@ class Knowledge:
         without[COURSE_LAG, COURSE_LAG] = NO_LAG_SIGMA_S**2
         return dataclasses.replace(self, mean=self.mean - gain * lag_s, covariance=without)
 
+    def with_covariance(self, covariance: Array, wide: Knowledge) -> Knowledge:
+        """With another covariance (8, 8), scaled so that no number is known less well than in `wide`."""
+        limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
+        shrink = np.sqrt(limit / np.diag(covariance))
+        return dataclasses.replace(self, covariance=covariance * np.outer(shrink, shrink))
+
     def stated_sigma(self, before: Knowledge) -> Array:
         """1 sigma (8,) with what slip imitates; at most that `before` the drive."""
         return np.asarray(np.minimum(np.hypot(self.sigma, IMITATED), before.sigma))
@@ -108,7 +114,7 @@ def assumed(
     sigma = np.array(
         [
             (SKID_TURN_SIGMA if skids else ROLL_TURN_SIGMA) if yaw_of_wheels else GYRO_SCALE_SIGMA,
-            max(bias_sigma_radps, BIAS_SIGMA_RADPS),
+            max(bias_sigma_radps, LEAST_BIAS_SIGMA_RADPS),
             WHEEL_SCALE_SIGMA,
             ANTENNA_SIGMA_M,
             ANTENNA_SIGMA_M,
@@ -164,7 +170,4 @@ def _rows(known: SensorNumbers, yaw: str) -> dict[int, KnownNumber]:
 
 def for_the_next_run(known: Knowledge, wide: Knowledge, yaw: str) -> Knowledge:
     """What one run gave, as it is known of the next one; no number is known less well than in `wide`."""
-    covariance = known.covariance + np.diag(_change_sigma(yaw) ** 2)
-    limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
-    shrink = np.sqrt(limit / np.diag(covariance))
-    return dataclasses.replace(known, covariance=covariance * np.outer(shrink, shrink))
+    return known.with_covariance(known.covariance + np.diag(_change_sigma(yaw) ** 2), wide)

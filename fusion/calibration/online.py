@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 from collections import deque
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.fit import combined, started
 from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned, node_due
-from terrafusion.fusion.calibration.numbers import GNSS_DELAY, Knowledge
+from terrafusion.fusion.calibration.numbers import Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 STEP_S = 4.0
@@ -146,10 +145,7 @@ class SelfCalibration:
         self._far = FAR_MISFIT < work.misfit < BETTER * self._step_misfit
         self._step_misfit = work.misfit
         if len(self._state) >= MOST_NODES:
-            wider = dataclasses.replace(found, covariance=found.covariance * FORGOTTEN)
-            limit = np.minimum(np.diag(wider.covariance), np.diag(self.prior.covariance))
-            shrink = np.sqrt(limit / np.diag(wider.covariance))
-            self.before = dataclasses.replace(wider, covariance=wider.covariance * np.outer(shrink, shrink))
+            self.before = found.with_covariance(found.covariance * FORGOTTEN, self.prior)
             self._begin()
         return True
 
@@ -168,11 +164,6 @@ class SelfCalibration:
         state[known:, 0], state[known:, 1], state[known:, 2] = at.real, at.imag, yaw + path.yaw_rad[new]
         state[known:, 3:] = last[3:]
         return Nodes(drive, state)
-
-    @property
-    def gnss_delay_s(self) -> float:
-        """Lateness of the fixes' stamps."""
-        return float(self.known.mean[GNSS_DELAY])
 
 
 def _empty(antenna_m: complex) -> MotionSegment:

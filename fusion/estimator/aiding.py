@@ -16,7 +16,8 @@ from terrafusion.fusion.estimator.barometer import BarometerAiding
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.magnetometer import MagnetometerAiding
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.streams import GnssFix, ImuStream
+from terrafusion.fusion.inputs.streams import ImuStream
+from terrafusion.fusion.inputs.validation import GnssFix
 
 
 class AidingSensors:

@@ -16,8 +16,8 @@ from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream, turned
-from terrafusion.fusion.inputs.validation import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, turned
+from terrafusion.fusion.inputs.validation import MOST_AWAY_M, MOST_HEIGHT_M, GnssFix, as_number, as_numbers
 from terrafusion.fusion.noise.policy import SensorNoise
 
 STILL_MPS = 0.01
@@ -26,7 +26,7 @@ WINDOW_NS = 1_000_000_000
 LEVEL_SIGMA_STILL_RAD, LEVEL_SIGMA_MOVING_RAD = 0.02, 0.05
 LEAST_RATIO = 0.3
 """Driven over dead-reckoned distance below which the robot is stuck and shows no heading."""
-BIAS_SIGMA_RADPS = 0.004
+UNSEEN_BIAS_SIGMA_RADPS = 0.004
 """Least prior of the gyro's bias where the robot did not stand at the start: data sheets and drivers promise
 less than is found (0.0035 rad/s on a Husky whose driver removes it at rest)."""
 LEAST_SIGMA, MOST_YAW_RAD = 1e-6, 100.0
@@ -118,7 +118,8 @@ def initial_state(
     yaw = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
     sigmas = [level, level, yaw, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
     seen = start.gyro_bias_radps is not None or imu.gyro_bias_sigma_radps == 0.0
-    gyro_bias_sigma = imu.gyro_bias_sigma_radps if seen else max(imu.gyro_bias_sigma_radps, BIAS_SIGMA_RADPS)
+    least_bias = 0.0 if seen else UNSEEN_BIAS_SIGMA_RADPS
+    gyro_bias_sigma = max(imu.gyro_bias_sigma_radps, least_bias)
     sigmas += [imu.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_bias_sigma + 1e-6] * 3
     return state, np.array([*sigmas, *linear_sigma.tolist()])
 

@@ -44,7 +44,7 @@ LEARNED_S = 10.0
 PRIOR_MOVES, MOST_MOVES = 3.0, 30.0
 """Moves for which the data sheet counts, and those that are remembered (assumed)."""
 LARGEST_MOVE = 4.0
-"""Ratio of a move's square over the expected one from which it counts no more: the robot skidded (assumed)."""
+"""Ratio of a move's square to the expected one from which it counts no more: a skid (assumed)."""
 TELLING = 0.1
 """Least share of a move that the estimate can show."""
 

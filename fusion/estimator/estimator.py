@@ -71,8 +71,7 @@ from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-OUTAGE_S = 2.0
-LONGEST_STEP_S = 1.0
+OUTAGE_S, LONGEST_STEP_S = 2.0, 1.0
 SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
@@ -317,7 +316,9 @@ class Estimator:
         if self.config.inputs.planar and wheels is not None:
             gained_mps = before.rolling * wheels.speed_change_mps
             segments = with_wheel_acceleration(segments, gained_mps / dt)
-        segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
+        if self._skid.friction is not None:
+            link_inputs = t_ns, dt, segments, wheels, before, self._covariance, self._skid.rate_m2ps
+            segments, wheels = self._skid.friction.step(*link_inputs)
         k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
         gap = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False

@@ -28,7 +28,8 @@ from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeySt
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 
 FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])

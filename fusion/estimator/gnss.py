@@ -203,7 +203,7 @@ class GnssUpdater:
         self._pair, place = self.track.pair(fix), self._antenna(chain, k)
         if self._pair is None:
             return False
-        refused = self.plausible.refusal(self._pair, place, self.track)
+        refused = self.plausible.refusal(self._pair, place)
         if refused is None:
             return False
         if self.plausible.mirrored:

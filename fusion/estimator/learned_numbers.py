@@ -37,7 +37,8 @@ from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.slow_states import SLIP_STEADY
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
+from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 
@@ -135,8 +136,8 @@ class LearnedNumbers:
 
     def keyframe(
         self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
-    ) -> bool:
-        """Take the motion of `dt_s` up to the newest keyframe; True when that put states in doubt.
+    ) -> None:
+        """Take the motion of `dt_s` up to the newest keyframe.
 
         Args:
             rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
@@ -144,7 +145,7 @@ class LearnedNumbers:
         """
         if self.calibration is not None:
             self._drive(self.calibration, chain, rolled_m, float(gyro_radps[2]) * dt_s)
-        return self.mounting.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
+        self.mounting.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
 
     def _drive(
         self, learning: SelfCalibration, chain: Chain, rolled_m: float | None, turn_rad: float
@@ -161,25 +162,23 @@ class LearnedNumbers:
         t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
         learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
 
-    def advance(self, chain: Chain) -> bool:
+    def advance(self, chain: Chain) -> None:
         """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new
-        numbers. True when that put the place in doubt.
+        numbers.
         """
         learning = self.calibration
         if learning is None or not learning.advance():
-            return False
+            return
         if self._before_skid is not None and not self._explained(learning):
-            return False
+            return
         self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
         self._past.append((t_ns, self._known))
         antenna_m, delay_s = gnss.antenna_m, gnss.delay_s
         self._apply(self._known, t_ns)
         speed_mps = float(np.linalg.norm(chain.state(chain.last).velocity))
         moved_m = math.hypot(*(gnss.antenna_m - antenna_m)[:2], speed_mps * (gnss.delay_s - delay_s))
-        if moved_m <= learning.usual_sigma_m:
-            return False
-        _doubt_place(chain, moved_m)
-        return True
+        if moved_m > learning.usual_sigma_m:
+            _doubt_place(chain, moved_m)
 
     def course_lag_s(self) -> tuple[float, float]:
         """Time by which the course follows the heading, and its 1 sigma on other grounds; see `numbers`."""

@@ -19,7 +19,7 @@ from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
 from terrafusion.fusion.graph.node import Node
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 
 PLACE = (2, 3, 4, 5)
 """Tangent of heading and position: what a local frame leaves open; the last is the height."""

@@ -12,11 +12,6 @@ from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
-    if breakdowns := estimator.breakdowns:
-        notes.append(
-            f"the numbers broke down {times(breakdowns)}, and the estimator started anew: "
-            "check units and axes"
-        )
     if gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     elif gnss.local:

@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Complex
+from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.dead_reckoning import (
     LEAST_TURN_RAD,
@@ -144,7 +145,7 @@ class FixPlausibility:
     _doubt_m: complex = 0j
     _since: list[FixPair] = field(default_factory=list)
 
-    def refusal(self, pair: FixPair, estimate: complex, track: DeadReckoning) -> str | None:
+    def refusal(self, pair: FixPair, estimate: complex) -> str | None:
         """Why a fix must not be used whatever the gate says; None where it may be.
 
         `estimate` is the antenna (east + i north, m) by the estimate at the fix.
@@ -278,11 +279,12 @@ def within_reach(a: FixPair, b: FixPair, scale: float) -> bool:
     return abs(b.fix - a.fix) <= reach_m
 
 
-def similarity(z: Array, fix: Array) -> tuple[complex, float]:
+def similarity(z: Complex, fix: Complex) -> tuple[complex, float]:
     """Turn and scale, as a complex number, that bring a path onto fixes, and the median distance left, m."""
-    z, fix = z - z.mean(), fix - fix.mean()
-    turn = complex(np.vdot(z, fix) / max(float(np.vdot(z, z).real), 1e-12))
-    return turn, float(np.median(np.abs(fix - turn * z)))
+    rotation, information = planar_rotation(z, fix)
+    turn = rotation / max(information, 1e-12)
+    left = fix - turn * z
+    return turn, float(np.median(np.abs(left - left.mean())))
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,6 @@ class PathShape:
         own, mirrored: whether the path, or its image, fits: in scale, and within `allowed_m`.
     """
 
-    count: int
     own_m: float
     mirrored_m: float
     own: bool
@@ -305,13 +306,13 @@ class PathShape:
     def of(cls, pairs: list[FixPair]) -> PathShape:
         """The shape of fixes."""
         if len(pairs) < MIRROR_FIXES:
-            return cls(0, 0.0, 0.0, False, False, 0.0)
+            return cls(0.0, 0.0, False, False, 0.0)
         z, fix = (np.array([getattr(p, name) for p in pairs]) for name in ("z", "fix"))
         sigma_m = max(p.sigma_m for p in pairs)
         allowed_m = SHAPE_SIGMA * sigma_m + SHAPE_SHARE * float(np.abs(np.diff(z)).sum())
         fits = [similarity(path, fix) for path in (z, z.conj())]
         own, mirrored = (abs(abs(a) - 1.0) <= MIRROR_RATIO and m <= allowed_m for a, m in fits)
-        return cls(len(pairs), fits[0][1], fits[1][1], own, mirrored, sigma_m)
+        return cls(fits[0][1], fits[1][1], own, mirrored, sigma_m)
 
     def is_mirrored(self) -> bool:
         """Whether only the image fits, clearly."""

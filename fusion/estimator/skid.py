@@ -21,7 +21,6 @@ from terrafusion.fusion.estimator.friction import FrictionEstimator
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
 
 SAME_SIDE = 0.5
@@ -141,20 +140,6 @@ class SkidDetector:
             return wheels
         self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
         return wheels.with_extra_variance(self.rate_m2ps * driven_s)
-
-    def friction_link(
-        self,
-        t_ns: int,
-        dt_s: float,
-        segments: list[ImuSegment],
-        wheels: WheelIncrement | None,
-        before: KeyState,
-        covariance: Array,
-    ) -> tuple[list[ImuSegment], WheelIncrement | None]:
-        """Segments and wheel increment of a keyframe's link; see `FrictionEstimator.step`."""
-        if self.friction is None:
-            return segments, wheels
-        return self.friction.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array, fix_m2: float) -> None:
         """Adapt the rate to a fix that is used: `innovation_m` (2,), the variances (2,) predicted for it, and

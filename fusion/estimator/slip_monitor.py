@@ -108,12 +108,8 @@ class MotionMonitor:
         self._watch_slip(windows, dt)
         self.cause = None if stuck is None else self._cause(stuck)
 
-    def travel(self, seconds: float) -> Travel | None:
-        """Travel over the last `seconds`; None before so much is known, or where wheels are missing."""
-        return self.travels(seconds)[0]
-
     def travels(self, *windows_s: float) -> list[Travel | None]:
-        """`travel` over several windows, the shortest first.
+        """Travel over the last windows, the shortest first; None before so much is known or without wheels.
 
         Errors of the estimated speed outlast a window: their sigmas add up.
         """

@@ -23,7 +23,8 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import no_motion_factor
-from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.validation import GnssFix
 
 CREEP_MPS = 0.02
 """The slowest motion that the wheels must show within a window."""

@@ -23,9 +23,6 @@ from terrafusion.fusion.inputs.validation import (
     beyond,
     checked_time,
 )
-from terrafusion.fusion.inputs.validation import (
-    GnssFix as GnssFix,
-)
 
 
 @dataclass(eq=False)

@@ -198,9 +198,9 @@ class DdsBus:
                     count += 1
         return count
 
-    def publish(self, topic: str, msgtype: str, cdr: bytes, latched: bool = False) -> None:
+    def publish(self, topic: str, msgtype: str, cdr: bytes) -> None:
         """Send a message; publishers are reliable, which serves both kinds of subscribers."""
-        end = self._writers.get(topic) or self.advertise(topic, msgtype, latched)
+        end = self._writers.get(topic) or self.advertise(topic, msgtype)
         sample = raw_type(msgtype).__new__(raw_type(msgtype))
         sample.cdr = cdr
         end.entity.write(sample)
@@ -212,10 +212,6 @@ class DdsBus:
         writer = DataWriter(self._participant, self._topic(topic, msgtype), self._qos(latched, True))
         self._writers[topic] = _Endpoint(topic, msgtype, writer)
         return self._writers[topic]
-
-    def subscribers(self, topic: str) -> int:
-        """How many receive a topic that is published here."""
-        return len(self._writers[topic].entity.get_matched_subscriptions())
 
     def close(self) -> None:
         """Leave the domain."""

@@ -221,7 +221,7 @@ class LiveNode:
             self.estimator.finish()
 
     def _begin_ordering(self) -> None:
-        self._ordered = OrderedSamples("imu", self.options.wait_s)
+        self._ordered = OrderedSamples(self.options.wait_s)
         self._jump, self._back = TimeJump(Newest()), 0
         self._early_fixes = EarlyFixes(self._jump.newest)
         self._received_ns = 0

@@ -24,12 +24,11 @@ class OrderedSamples:
     """Holds samples back until those of the same time have come.
 
     Args:
-        clock: the channel whose newest time releases samples.
-        wait_s: how far it must be ahead.
+        wait_s: how far the newest sample of the IMU must be ahead.
     """
 
-    def __init__(self, clock: str, wait_s: float) -> None:
-        self._clock, self._wait_ns = clock, round(wait_s * 1e9)
+    def __init__(self, wait_s: float) -> None:
+        self._wait_ns = round(wait_s * 1e9)
         self._heap: list[tuple[int, int, int, Any]] = []
         self._number = 0
         self.newest_ns: int | None = None
@@ -39,7 +38,7 @@ class OrderedSamples:
         """Take a sample of a channel."""
         heapq.heappush(self._heap, (t_ns, RANK[channel], self._number, sample))
         self._number += 1
-        if channel == self._clock:
+        if channel == "imu":
             self.newest_ns = t_ns if self.newest_ns is None else max(self.newest_ns, t_ns)
 
     def released(self, now_s: float) -> Iterator[Any]:
@@ -51,7 +50,7 @@ class OrderedSamples:
             yield heapq.heappop(self._heap)[-1]
 
     def rest(self) -> Iterator[Any]:
-        """All that are left, but those after the last of the clock, which can make no keyframe."""
+        """All that are left, but those after the last of the IMU, which can make no keyframe."""
         while self._heap and self.newest_ns is not None and self._heap[0][0] <= self.newest_ns:
             yield heapq.heappop(self._heap)[-1]
         self._heap.clear()

@@ -16,7 +16,8 @@ from terrafusion.fusion.graph.factors import SURGE_SPEED_MPS, wheel_increment
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, KeyState
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, residual, slip_of
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle

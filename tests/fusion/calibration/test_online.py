@@ -164,7 +164,7 @@ def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior()
     covariance[3, 3] = 1e-6
     given = dataclasses.replace(PRIOR, covariance=covariance)
     learning = SelfCalibration(given, NOISE, 0j)
-    assert learning.gnss_delay_s == PRIOR.mean[GNSS_DELAY]
+    assert learning.known.mean[GNSS_DELAY] == PRIOR.mean[GNSS_DELAY]
     ended = driven(figure(300.0, fix_sigma_m=0.05), learning, until=lambda: learning.before is not given)
     known, begin = ended[-1], learning.before
     wider, prior = known.covariance * online.FORGOTTEN, np.diag(covariance)
@@ -173,7 +173,7 @@ def test_what_a_stretch_knows_grows_uncertain_but_never_beyond_the_first_prior()
     correlations = [c / np.sqrt(np.outer(np.diag(c), np.diag(c))) for c in (wider, begin.covariance)]
     assert np.allclose(*correlations, atol=1e-9)
     assert same(begin.mean, known.mean)
-    assert learning.gnss_delay_s == known.mean[GNSS_DELAY] != PRIOR.mean[GNSS_DELAY]
+    assert learning.known.mean[GNSS_DELAY] == known.mean[GNSS_DELAY] != PRIOR.mean[GNSS_DELAY]
 
 
 def step_times(drive: MotionSegment) -> tuple[list[float], list[int]]:

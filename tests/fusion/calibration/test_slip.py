@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.motion import MotionSegment, node_starts
+from terrafusion.fusion.calibration.motion import MotionSegment
 from terrafusion.fusion.calibration.numbers import Knowledge, assumed
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.calibration.slip import PRIOR_PAIRS, SlipMoments, slip_process
+from tests.fusion.calibration.nodes import node_starts
 from tests.fusion.calibration.test_online import driven
 
 STEP_S, ASSUMED_S = 0.1, 300.0

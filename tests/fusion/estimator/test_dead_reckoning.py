@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from terrafusion.fusion.estimator.dead_reckoning import LEAST_DIFFERENCES, MOST_DIFFERENCES, DeadReckoning
 from terrafusion.fusion.estimator.gnss import ALL_NEW
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 
 STEP_NS, FIX_EVERY = 100_000_000, 5
 CLAIM_M = 0.1

@@ -21,7 +21,8 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.friction import FrictionEstimator, friction_estimator
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.choose import choose_vehicle

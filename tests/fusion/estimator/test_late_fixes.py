@@ -10,7 +10,7 @@ import pytest
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
 

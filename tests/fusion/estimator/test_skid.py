@@ -17,7 +17,7 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate, simulate_run

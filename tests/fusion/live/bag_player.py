@@ -47,10 +47,9 @@ def main() -> None:
     found = [one for one in found if one[1] in LATCHED or span[0] <= one[0] <= span[1]]
     bus = DdsBus(arguments.domain, loopback=True)
     types = {topic: msgtype for _, topic, msgtype, _ in found}
-    for topic, msgtype in types.items():
-        bus.advertise(topic, msgtype, latched=topic in LATCHED)
+    ends = {topic: bus.advertise(topic, msgtype, topic in LATCHED) for topic, msgtype in types.items()}
     deadline = time.monotonic() + 15.0
-    while not bus.subscribers("/imu/data") and time.monotonic() < deadline:
+    while not ends["/imu/data"].entity.get_matched_subscriptions() and time.monotonic() < deadline:
         time.sleep(0.02)
     time.sleep(0.3)  # the other topics
     begun = time.monotonic()
@@ -60,7 +59,7 @@ def main() -> None:
             time.sleep(ahead)
         if topic not in LATCHED and chance.random() < arguments.loss:
             continue
-        bus.publish(topic, msgtype, cdr, latched=topic in LATCHED)
+        bus.publish(topic, msgtype, cdr)
         if (
             arguments.garbage and topic == "/imu/data" and i % 7 == 0 and i > 2500
         ):  # no numbers for the acceleration
