@@ -17,19 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers.log_folder import decimal_seconds
 from terrafusion.datasets.writers.tum import write_tum
-from terrafusion.fusion.config.assumptions import Assumption
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
 from terrafusion.fusion.graph.key_state import LINEAR
-from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.scores import Scores
-from terrafusion.fusion.metrics.verdict import Verdict
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
 from terrafusion.fusion.outputs.linear_states import learned_rows, series
 from terrafusion.fusion.replay import ReplayResult
@@ -38,65 +35,42 @@ SCHEMA = "terrafusion.replay/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")
 
 
-def build_metrics(
-    *,
-    log: str,
-    vehicle: str,
-    mode: str,
-    duration_s: float,
-    distance_m: float,
-    realtime_factor: float,
-    updates: int,
-    latencies_ms: ArrayLike,
-    terrain: Mapping[str, float],
-    changes: int,
-    rejected: Mapping[str, int],
-    scores: Scores,
-    status: Mapping[str, str],
-    notes: Sequence[str] = (),
-    calibration: Sequence[Mapping[str, Any]] = (),
-    verdict: Verdict | None = None,
-    assumed: Sequence[Assumption] = (),
-    baselines: Baselines | None = None,
-) -> dict[str, Any]:
-    """The content of `metrics.json`.
+def metrics_of(result: ReplayResult) -> dict[str, Any]:
+    """The content of `metrics.json` (docs/schemas/metrics.schema.json) for one replay.
 
-    Args:
-        log: name of the recording.
-        mode: one of `MODES`.
-        realtime_factor: seconds of drive processed in a second.
-        latencies_ms: (K,) time that each update took.
-        terrain: share of the time spent on each class (see `terrain_shares`).
-        changes: how many times a weight changed.
-        rejected: measurements rejected by a gate, by sensor.
-        status: `value` and `message` (see `final_status`).
-        notes: what was assumed; notes on the scoring are added.
-        calibration: rows of `linear_states.calibration` where it was asked for, else of `learned_rows`.
-        verdict, assumed, baselines: see `ReplayResult`; without them their keys are absent.
+    `calibration` has rows of `linear_states.calibration` where it was asked for, else of `learned_rows`; the
+    notes on the scoring follow those of the estimate.
+
+    Raises:
+        ValueError: a mode not in `MODES`.
     """
-    if mode not in MODES:
-        raise ValueError(f"mode is '{mode}', not one of {', '.join(MODES)}")
-    latencies = np.asarray(latencies_ms, dtype=float).ravel()
+    if result.mode not in MODES:
+        raise ValueError(f"mode is '{result.mode}', not one of {', '.join(MODES)}")
+    estimate, scores, verdict = result.estimate, result.scores, result.verdict
+    latencies = np.asarray(result.latencies_ms, dtype=float).ravel()
     latencies = latencies[np.isfinite(latencies)]
     p50, p99 = np.percentile(latencies, [50.0, 99.0]) if len(latencies) else (0.0, 0.0)
+    shares = terrain_shares(estimate)
     return {
         "schema": SCHEMA,
-        "log": log,
-        "vehicle": vehicle,
-        "mode": mode,
-        "duration_s": _at_least_zero(duration_s),
-        "distance_m": _at_least_zero(distance_m),
-        "realtime_factor": _at_least_zero(realtime_factor),
-        "updates": int(updates),
+        "log": result.recording.name,
+        "vehicle": result.vehicle.name,
+        "mode": result.mode,
+        "duration_s": _at_least_zero(result.recording.duration_s()),
+        "distance_m": _at_least_zero(estimate.trajectory.path_length_m()),
+        "realtime_factor": _at_least_zero(result.realtime_factor()),
+        "updates": len(estimate.trajectory),
         "update_latency_ms": {"p50": float(p50), "p99": float(p99)},
-        "terrain": {name: min(1.0, _at_least_zero(share)) for name, share in terrain.items()},
-        "weights": {"changes": int(changes)},
-        "rejected": {"gnss": 0, "wheels": 0} | {name: int(count) for name, count in rejected.items()},
+        "terrain": {name: min(1.0, _at_least_zero(share)) for name, share in shares.items()},
+        "weights": {"changes": len(estimate.changes)},
+        "rejected": {"gnss": int(result.rejected_gnss), "wheels": int(result.rejected_wheels)},
         **_scored(scores),
-        "calibration": [finite(row) for row in calibration],
-        "status": {"value": status["value"], "message": status["message"]},
-        "notes": [*notes, *(note for note in scores.notes if note not in notes)],
-        **_judged(verdict, assumed, baselines),
+        "calibration": [finite(row) for row in calibration_of(estimate) or learned_rows(result.learned)],
+        "status": final_status(estimate),
+        "notes": [*estimate.notes, *(note for note in scores.notes if note not in estimate.notes)],
+        "verdict": {"value": verdict.value, "reasons": list(verdict.reasons)},
+        "assumed": [finite(dataclasses.asdict(one)) for one in result.assumed],
+        "baselines": finite(result.baselines.record()),
     }
 
 
@@ -111,18 +85,6 @@ def _scored(scores: Scores) -> dict[str, Any]:
             finite(dataclasses.asdict(row)) | {"verdict": row.verdict()} for row in scores.consistency
         ],
     }
-
-
-def _judged(
-    verdict: Verdict | None, assumed: Sequence[Assumption], baselines: Baselines | None
-) -> dict[str, Any]:
-    judged: dict[str, Any] = {}
-    if verdict is not None:
-        judged["verdict"] = {"value": verdict.value, "reasons": list(verdict.reasons)}
-        judged["assumed"] = [finite(dataclasses.asdict(one)) for one in assumed]
-    if baselines is not None:
-        judged["baselines"] = finite(baselines.record())
-    return judged
 
 
 def terrain_shares(estimate: Estimate) -> dict[str, float]:
@@ -150,31 +112,6 @@ def final_status(estimate: Estimate) -> dict[str, str]:
 def is_local(estimate: Estimate) -> bool:
     """Whether start and heading of the path are arbitrary, because no fix ever came."""
     return bool(len(estimate.status)) and bool((estimate.status == "no_gnss").all())
-
-
-def metrics_of(result: ReplayResult) -> dict[str, Any]:
-    """The content of `metrics.json` (docs/schemas/metrics.schema.json) for one replay."""
-    estimate = result.estimate
-    return build_metrics(
-        log=result.recording.name,
-        vehicle=result.vehicle.name,
-        mode=result.mode,
-        duration_s=result.recording.duration_s(),
-        distance_m=estimate.trajectory.path_length_m(),
-        realtime_factor=result.realtime_factor(),
-        updates=len(estimate.trajectory),
-        latencies_ms=result.latencies_ms,
-        terrain=terrain_shares(estimate),
-        changes=len(estimate.changes),
-        rejected={"gnss": result.rejected_gnss, "wheels": result.rejected_wheels},
-        scores=result.scores,
-        status=final_status(estimate),
-        notes=estimate.notes,
-        calibration=calibration_of(estimate) or learned_rows(result.learned),
-        verdict=result.verdict,
-        assumed=result.assumed,
-        baselines=result.baselines,
-    )
 
 
 def write_outputs(

@@ -21,13 +21,14 @@ from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.metrics.scores import score
 from terrafusion.fusion.outputs.linear_states import QUANTITIES, calibration, cells, series
-from terrafusion.fusion.outputs.replay_files import build_metrics, estimate_columns, final_status
+from terrafusion.fusion.outputs.replay_files import estimate_columns, metrics_of
 from terrafusion.fusion.outputs.ros_estimate import written_estimate
 from terrafusion.fusion.reports.plots.replay import plot_skid_steering
 from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
+from tests.fusion.replayed import result_of
 
 SCHEMA = Path(__file__).parents[3] / "docs" / "schemas" / "metrics.schema.json"
 WANDERING = LINEAR[1 : LINEAR.index("radius_scale")]
@@ -46,12 +47,8 @@ def with_states(estimate: Estimate, calibrated: bool) -> Estimate:
     return dataclasses.replace(estimate, linear=value, linear_sigma=sigma, bias_sigma=np.full((n, 6), 0.003))
 
 
-def metrics_of(d: Any, estimate: Estimate) -> dict[str, Any]:
-    return build_metrics(
-        log="synthetic", vehicle="elevate", mode="adaptive", duration_s=120.0, distance_m=118.0,
-        realtime_factor=90.0, updates=1, latencies_ms=[1.0], terrain={}, changes=0, rejected={},
-        scores=score(estimate, d.recording), status=final_status(estimate), calibration=calibration(estimate),
-    )  # fmt: skip
+def metrics_for(d: Any, estimate: Estimate) -> dict[str, Any]:
+    return metrics_of(result_of(d.recording, estimate, score(estimate, d.recording)))
 
 
 def test_a_series_is_there_only_where_the_state_was_estimated(drive: Any) -> None:
@@ -93,7 +90,7 @@ def test_columns_of_the_states_come_after_those_of_the_contract(drive: Any, cali
 def test_metrics_tell_the_calibration_and_keep_to_the_schema(drive: Any) -> None:
     d = drive()
     for calibrated, count in ((False, 0), (True, len(CALIBRATION))):
-        metrics = metrics_of(d, with_states(d.estimate, calibrated))
+        metrics = metrics_for(d, with_states(d.estimate, calibrated))
         Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8"))).validate(
             json.loads(to_json(metrics), parse_constant=pytest.fail)
         )
@@ -105,7 +102,7 @@ def test_the_report_says_what_was_observed_and_what_could_not_be(drive: Any, tmp
     pages = []
     for calibrated in (False, True):
         estimate = with_states(d.estimate, calibrated)
-        run = ReportRun("adaptive", metrics_of(d, estimate), estimate, score(estimate, d.recording))
+        run = ReportRun("adaptive", metrics_for(d, estimate), estimate, score(estimate, d.recording))
         page = write_report(tmp_path / f"{calibrated}.html", "Replay", [run], d.recording)
         pages.append(page.read_text(encoding="utf-8"))
     assert all("Yaw scale: true over wheel yaw rate" in page for page in pages)

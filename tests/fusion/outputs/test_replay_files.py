@@ -16,38 +16,18 @@ from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.readers import open_recording
 from terrafusion.fusion.metrics.scores import HeldOut, Outage, Scores, score
+from terrafusion.fusion.outputs import replay_files
 from terrafusion.fusion.outputs.replay_files import (
     MODES,
-    build_metrics,
-    final_status,
+    metrics_of,
     terrain_shares,
     write_outputs,
 )
-from tests.fusion.rejected import rejected_counts
+from tests.fusion.replayed import result_of
 
 SCHEMA = json.loads(
     (Path(__file__).parents[3] / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8")
 )
-
-
-def metrics_of(estimate, scores, **changed):
-    pieces = {
-        "log": "synthetic",
-        "vehicle": "elevate",
-        "mode": "adaptive",
-        "duration_s": 120.0,
-        "distance_m": 118.0,
-        "realtime_factor": 90.0,
-        "updates": len(estimate.trajectory),
-        "latencies_ms": np.array([0.5, 0.6, 2.0]),
-        "terrain": terrain_shares(estimate),
-        "changes": len(estimate.changes),
-        "rejected": rejected_counts(estimate),
-        "scores": scores,
-        "status": final_status(estimate),
-        "notes": estimate.notes,
-    }
-    return build_metrics(**{**pieces, **changed})
 
 
 def check(metrics):
@@ -59,9 +39,8 @@ def check(metrics):
 @pytest.mark.parametrize("mode", MODES)
 def test_metrics_keep_to_the_schema(drive, mode):
     d = drive(drift_mps=0.01)
-    metrics = metrics_of(
-        d.estimate, score(d.estimate, d.recording, held_out=d.fixes, outages=[Outage(10, 20)]), mode=mode
-    )
+    scores = score(d.estimate, d.recording, held_out=d.fixes, outages=[Outage(10, 20)])
+    metrics = metrics_of(result_of(d.recording, d.estimate, scores, mode=mode))
     check(metrics)
     assert metrics["schema"] == "terrafusion.replay/1"
     assert metrics["ate_m"] > 0
@@ -78,23 +57,24 @@ def test_metrics_keep_to_the_schema(drive, mode):
     assert {row["verdict"] for row in metrics["consistency"]} <= {"consistent", "overconfident", "cautious"}
 
 
-def test_metrics_of_a_run_that_broke_are_still_valid(drive):
+def test_metrics_of_a_run_that_broke_are_still_valid(drive, monkeypatch):
     d = drive()
     bad = float("nan")
     broken = Scores(
         "truth", bad, {"10": bad, "50": None, "100": float("inf")}, bad, bad, bad, None,
         (), ("note",),
     )  # fmt: skip
+    monkeypatch.setattr(replay_files, "terrain_shares", lambda _: {"mud": bad, "snow": 1.0 + 1e-12})
+    path = d.estimate.trajectory
+    away = dataclasses.replace(path, position_m=np.full(path.position_m.shape, bad))
+    estimate = dataclasses.replace(d.estimate, trajectory=away)
     metrics = metrics_of(
-        d.estimate,
-        broken,
-        duration_s=bad,
-        distance_m=float("inf"),
-        realtime_factor=bad,
-        latencies_ms=[bad, bad],
-        terrain={"mud": bad, "snow": 1.0 + 1e-12},
+        result_of(d.recording, estimate, broken, seconds=bad, latencies_ms=np.array([bad, bad]))
     )
     check(metrics)
+    assert metrics["terrain"] == {"mud": 0.0, "snow": 1.0}
+    assert metrics["distance_m"] == metrics["realtime_factor"] == 0.0
+    assert metrics["update_latency_ms"] == {"p50": 0.0, "p99": 0.0}
     assert metrics["ate_m"] is None
     assert metrics["rpe_percent"] == {"10": None, "50": None, "100": None}
 
@@ -102,13 +82,15 @@ def test_metrics_of_a_run_that_broke_are_still_valid(drive):
 def test_metrics_with_nothing_scored_are_valid(drive):
     d = drive()
     recording = dataclasses.replace(d.recording, truth=None)
-    check(metrics_of(d.estimate, score(d.estimate, recording, outages=[Outage(900, 5)])))
+    scores = score(d.estimate, recording, outages=[Outage(900, 5)])
+    check(metrics_of(result_of(recording, d.estimate, scores)))
 
 
 def test_an_unknown_mode_is_refused(drive):
     d = drive()
+    result = result_of(d.recording, d.estimate, score(d.estimate, d.recording), mode="magic")
     with pytest.raises(ValueError, match="not one of"):
-        metrics_of(d.estimate, score(d.estimate, d.recording), mode="magic")
+        metrics_of(result)
 
 
 def test_numbers_that_are_not_finite_become_null():
@@ -133,7 +115,7 @@ def test_all_files_are_written_and_read_back(drive, tmp_path):
     slip = d.estimate.slip.copy()
     slip[4] = np.nan
     estimate = dataclasses.replace(d.estimate, slip=slip)
-    metrics = metrics_of(estimate, score(estimate, d.recording))
+    metrics = metrics_of(result_of(d.recording, estimate, score(estimate, d.recording)))
     paths = write_outputs(tmp_path / "new" / "out", estimate, metrics, d.recording)
     assert set(paths) == {"metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl"}
     assert sorted(p.name for p in (tmp_path / "new" / "out").iterdir()) == sorted(paths)
@@ -163,7 +145,7 @@ def test_all_files_are_written_and_read_back(drive, tmp_path):
 
 def test_the_same_estimate_gives_the_same_bytes(drive, tmp_path):
     d = drive()
-    metrics = metrics_of(d.estimate, score(d.estimate, d.recording))
+    metrics = metrics_of(result_of(d.recording, d.estimate, score(d.estimate, d.recording)))
     first = write_outputs(tmp_path / "a", d.estimate, metrics, d.recording)
     second = write_outputs(tmp_path / "b", d.estimate, metrics, d.recording)
     for name, path in first.items():

@@ -16,11 +16,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.metrics.scores import Outage, score
-from terrafusion.fusion.outputs.replay_files import (
-    build_metrics,
-    final_status,
-    terrain_shares,
-)
+from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter as plots_filter
 from terrafusion.fusion.reports.plots import replay_map as plots_map
@@ -29,7 +25,7 @@ from terrafusion.fusion.reports.plots.sheet import Sheet, compact
 from terrafusion.fusion.reports.plots.style import colour_of, label_text, thin
 from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.fusion.reports.replay_text import ScoreRow, pick_pair, score_rows, summary_of_many
-from tests.fusion.rejected import rejected_counts
+from tests.fusion.replayed import result_of
 from tests.fusion.reports.browser import BROWSER, assert_drawn
 
 CLASSES = ("asphalt", "loose_sand", "mud", "unknown")
@@ -42,22 +38,9 @@ def make_run(d, name, recording=None, *, outages=OUTAGES, log="synthetic", **cha
     recording = recording or d.recording
     estimate = dataclasses.replace(d.estimate, **changed)
     scores = score(estimate, recording, held_out=d.fixes, outages=outages)
-    metrics = build_metrics(
-        log=log,
-        vehicle="elevate",
-        mode=name if name in ("adaptive", "fixed") else "robust",
-        duration_s=recording.duration_s(),
-        distance_m=118.0,
-        realtime_factor=90.0,
-        updates=len(estimate.trajectory),
-        latencies_ms=[0.5, 1.0],
-        terrain=terrain_shares(estimate),
-        changes=len(estimate.changes),
-        rejected=rejected_counts(estimate),
-        scores=scores,
-        status=final_status(estimate),
-        notes=estimate.notes,
-    )
+    named = dataclasses.replace(recording, name=log)
+    mode = name if name in ("adaptive", "fixed") else "robust"
+    metrics = metrics_of(result_of(named, estimate, scores, mode=mode))
     return ReportRun(name, metrics, estimate, scores)
 
 
