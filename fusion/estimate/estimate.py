@@ -85,7 +85,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """A measurement against its prediction: `value` (m or m/s), normalised square `nis` with `dof`.
+    """A measurement less its prediction: `value` (m; magnetometer: rad), normalised square `nis`, `dof`.
 
     `reason`: why it was not used, where more than its gate speaks against it.
     """

@@ -1,9 +1,9 @@
 """Barometer: height differences, with a bias that follows the weather.
 
-The pressure becomes a height in the standard atmosphere. Its difference to the estimated height is a bias
-that is unknown at the start and drifts with the weather, and a share of every climb, since the air is not
-as warm as the standard's. So a barometer does not measure height: it holds that of GNSS, or of the start.
-The samples of a second count as one.
+The pressure becomes a height in the standard atmosphere. It differs from the estimated height by a bias,
+unknown at the start and drifting with the weather, and by a share of every climb, since the air is not as
+warm as the standard's. So a barometer only holds the height of GNSS or of the start. The samples of a
+second count as one.
 """
 
 from __future__ import annotations

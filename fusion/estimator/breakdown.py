@@ -1,7 +1,6 @@
-"""Where the numbers of an estimator break down, it refuses the sample, starts anew and counts it.
+"""Where a graph has no finite solution, the estimator refuses the sample, starts anew and counts it.
 
-Sensors that contradict each other beyond all that a graph can hold (an accelerometer in g, wheels in rev/min)
-end in numbers that are not finite or in a system that has no solution.
+It happens where sensors contradict each other, such as an accelerometer in g or wheels in rev/min.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The filter is slow to see that its own heading was wrong or that a receiver is optimistic. Wheels and gyro
 alone trace the shape of the path; aligned with the fixes of the last half minute it shows the heading
-error, and how much the fixes scatter about it. Neither depends on what the filter made of those fixes.
+error and the scatter of the fixes, independently of the filter.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ class PathFit:
 
 @dataclass(eq=False)
 class FixPair:
-    """A fix (east + i north, m) its reported sigma, and the dead-reckoned antenna `z` (m) then.
+    """A fix (east + i north, m), its reported sigma, and the dead-reckoned antenna `z` (m) then.
 
     `reach_m`: how far the robot can have driven in all by then; `usable`: the fix may show the heading;
-    `alone`: it lies beyond reach, of the path and of the fixes refused before.
+    `alone`: it can be reached neither from the path nor from a fix refused before.
     """
 
     t_ns: int

@@ -1,16 +1,16 @@
-"""Whether the receiver's drift, as the graph has it, moves faster than a receiver drifts.
+"""Tests whether the estimated GNSS drift moves faster than a receiver drifts: then the wheels skid.
 
-Fixes of a stand-alone receiver are too coarse for the gate to refuse them when the wheels slide. What the
-wheels then get wrong goes into the drift state, which keeps it for a minute or more. In a consistent filter
-the estimate of a Gauss-Markov state d with sigma s and time constant T moves in the time t by
+Fixes of a stand-alone receiver are too coarse for the gate to reject them in a skid. The error of the
+wheels goes into the drift state and stays there for a minute or more. In a consistent filter the estimate
+of a Gauss-Markov state d with sigma s and time constant T moves in the time t by
 
     d(t) - a d(0) ,  a = exp(-t / T) ,  covariance  a^2 P(0) + s^2 (1 - a^2) - P(t) ,
 
 with P its covariance (increments of a conditional mean; Gelb 1974, Applied Optimal Estimation, ch. 4.2).
 
-A receiver that reports less than its data sheet may drift as its report or as the sheet says. The moves
-over longer times tell: s^2 follows the mean of their squares over those expected, step by step with falling
-gain (Robbins and Monro 1951, Ann. Math. Stat. 22(3)), and begins at the sheet's.
+A receiver that reports less than its data sheet may drift as its report or as the sheet says. So s is
+learned: s^2 begins at the sheet's and is scaled by the squares of longer moves over those expected, with
+falling gain (Robbins and Monro 1951, Ann. Math. Stat. 22(3)).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ TELLING = 0.1
 
 @dataclass
 class DriftWatch:
-    """The newest estimates of the drift.
+    """Estimates of the drift, and the sigma learned from them.
 
     Attributes:
         sigma_m, time_s: of the drift's Gauss-Markov process; sigma as learned.

@@ -1,4 +1,4 @@
-"""A fix and its keyframe: which one it is, how the antenna moves between both, and cutting the past off."""
+"""The keyframe of a fix, the motion of the antenna between both, and cutting the past off."""
 
 from __future__ import annotations
 

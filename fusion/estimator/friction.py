@@ -153,7 +153,7 @@ class FrictionEstimator:
         error_m = moved_m - predicted_m
         variance = 2.0 * sigma_m**2 + (PATH_SHARE * float(np.hypot(*moved_m))) ** 2 + PATH_SIGMA_M**2
         square = np.sum(error_m**2 / variance, axis=1)
-        # Ways overlap where fixes come faster than they are compared.
+        # At high fix rates the compared intervals overlap; each counts by 1/n.
         fixes = 1 + sum(1 for t_ns, *_ in self._fixes if self._fixes[-1][0] - t_ns < LEAST_INTERVAL_S * 1e9)
         self._score -= 0.5 * (FREEDOM + 2.0) * np.log1p(square / FREEDOM) / fixes
         self._score -= self._score.max()

@@ -86,9 +86,9 @@ class WheelGate:
     it counts less (Huber 1964, Ann. Math. Stat. 35(1)), far beyond not at all; but for at most `patience`
     consecutive keyframes, as the IMU drifts.
 
-    An increment that is far off or abrupt is a fault and says nothing of slip either: a change of wheel
-    speed makes slip new (`slow_states.step`), and with new slip any following increment would fit. The
-    first one believed after a fault has the change of speed since before it: none where a counter jumped,
+    An increment that is far off or abrupt is a fault. A faulty increment must not reset the slip (as a
+    change of wheel speed does in `slow_states.step`), else the gate would accept whatever follows. The
+    first one accepted after a fault has the change of speed since before it: none where a counter jumped,
     all of it where the wheels broke loose.
 
     Attributes:

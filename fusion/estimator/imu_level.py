@@ -48,7 +48,7 @@ class ImuLevel:
 
     Attributes:
         before: roll and pitch as known before the drive; known: now, as they are used.
-        corrects: which of both the drive corrects.
+        corrects: which of both are corrected by what the drive showed.
     """
 
     def __init__(self, config: EstimatorConfig, imu: ImuStream) -> None:

@@ -1,6 +1,6 @@
 """An IMU turned about its vertical axis: learned while the wheels roll, corrected where it is clear.
 
-Its tilt is that of `imu_level`.
+`imu_level` learns its tilt.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Between the state of a keyframe in the graph and the `State` that is reported."""
+"""From the state of a keyframe in the graph to the reported `State`, and back."""
 
 from __future__ import annotations
 

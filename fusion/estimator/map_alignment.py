@@ -1,4 +1,4 @@
-"""Alignment of a path that was begun without GNSS with the map.
+"""Aligns a path that was begun without GNSS with the map.
 
 Until fixes come the path is local: its start and heading are arbitrary. Wheels and gyro trace its shape
 (`DeadReckoning`); once the fixes of the last half minute show how that shape lies on the map, the window

@@ -1,4 +1,4 @@
-"""What an estimator made of its inputs, in sentences."""
+"""Notes on how an estimator used its inputs, in sentences."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The continuous frame of REP-105: the motion from keyframe to keyframe added up, which no fix makes jump.
 
-The estimate in `map` jumps where fixes correct it. In `odom` the robot moves by what wheels and IMU say of
-each step, solved with all that was known before the fixes of its end; the path drifts, but it is continuous.
+The estimate in `map` jumps where fixes correct it. In `odom` each step is the one estimated before the
+fixes at its end are used; the path drifts, but it is continuous.
 """
 
 from __future__ import annotations

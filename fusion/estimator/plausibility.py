@@ -1,4 +1,4 @@
-"""Whether fixes can be those of the robot: by what it can have driven, by its motion and by its turns.
+"""Tests whether fixes can be the robot's: by what it can have driven, by its motion and by its turns.
 
 A receiver that is wrong is often wrong for many fixes in a row, which agree with each other (a reflected
 signal, a wrong ambiguity, a position that it repeats). Wheels and gyro bound where the robot can be: a new
@@ -66,7 +66,7 @@ BEYOND = "the place lies beyond what the robot can have driven"
 
 @dataclass
 class FixRun:
-    """Fixes of which each can be reached from the one before; `reachable`: the first one could be, too."""
+    """Fixes, each within reach of the one before; `reachable`: the first was within reach of a used fix."""
 
     reachable: bool
     pairs: list[FixPair]
@@ -117,12 +117,11 @@ class RepeatedPosition:
 
 @dataclass
 class FixPlausibility:
-    """What fixes must be before the gate's verdict on them counts.
+    """Tests of fixes that overrule the gate.
 
     Attributes:
-        anchors: fixes used last before each change of place; the last is that of now.
-        runs: fixes refused since then.
-        run: that of the newest one.
+        anchors: last fixes used, before and after a jump of the estimate.
+        runs: fixes refused since then; run: the newest one's.
         mirrored: east and north are swapped, or one is reversed.
         jump_m: from the place left to the place believed, and the reach then; None where there is no doubt.
         repeated, turned, beyond, jumps: fixes not used, by reason, and jumps beyond reach.

@@ -1,12 +1,12 @@
 """Skid detector: GNSS fixes that contradict the wheels inflate the variance of the wheels' displacement.
 
-In a skid, slip and side-slip exceed what the noise of the ground allows within a second: the wheels keep
-good fixes out and lead the estimate astray again after each that is let in. But a robot can have skidded
-no further than its wheels rolled and its speed carried it since the last used fix. Rejected fixes that lie
-on one side of the estimate and within that reach refute the wheels, not the receiver. The variance that
-explains them (a random walk, m2 per second of driving) is kept and adapted by the innovations of accepted
-fixes (Mehra 1972, IEEE T-AC 17(5)). The wheels have led the velocity astray, too: it is in doubt by what
-carries the robot to the rejected fixes.
+In a skid, slip and side-slip exceed what the noise of the ground allows within a second. The gate then
+rejects good fixes, and after each accepted one the wheels pull the estimate off again. But a robot can have
+skidded no further than its wheels rolled and its speed carried it since the last used fix. Rejected fixes
+that lie on one side of the estimate and within that reach refute the wheels, not the receiver. The variance
+that explains them (a random walk, m2 per second of driving) is kept, and adapted by the innovations of
+accepted fixes (Mehra 1972, IEEE T-AC 17(5)). The velocity is wrong, too: its sigma becomes the speed that
+leads to the rejected fixes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _Passed = tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]
 
 
 class SkidDetector:
-    """How wrong the wheels are beyond their noise.
+    """Variance of the wheels' displacement in a skid, beyond their noise.
 
     Attributes:
         friction: friction estimator, where there is one.

@@ -12,8 +12,8 @@ the graph gets the independent measurement of s with the same effect on s and it
 
     R* = P_s^2 S / a^2 - P_s >= 0,    innovation* = innovation P_s / a.
 
-Other measurements of s shrink its error and c alike (`state_updated`; b itself is left as it is, as
-Schmidt's filter leaves considered parameters); motion adds to P_s alone.
+Other measurements of s shrink its error and c alike (`state_updated`) and leave b as it is, as Schmidt's
+filter does; motion adds to P_s alone.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """A running estimator as bytes, and back, so that it continues with the same bits.
 
-The file is a tree of JSON and a block of arrays; nothing in it is executed, no class is named that the
-library does not have, and no sizes are taken from it that its own length does not bear out. `restore`
-builds an estimator from the configuration, which the file does not hold, and fills in the state of the
-run. The tree is walked over the attributes of the estimator's objects, so that a new array or object is
-covered; what cannot be written makes `dump` fail, not `restore`.
+The file is a tree of JSON and a block of arrays. Nothing in it is executed; its classes must be the
+library's, and its sizes must fit its length. `restore` builds an estimator from the configuration, which
+the file does not hold, and fills in the state of the run. The tree follows the attributes of the
+estimator's objects, so that new ones are covered; what cannot be written makes `dump` fail, not `restore`.
 
 Layout: `MAGIC`, SHA-256 of the rest (32 bytes), length of the tree (8 bytes, little endian), the tree in
 UTF-8, the arrays end to end.
@@ -222,7 +221,7 @@ class _Writer:
 
 
 class _Reader:
-    """What `_Writer` wrote, put where a fresh estimator has the like."""
+    """Reads what `_Writer` wrote into the places of a fresh estimator."""
 
     def __init__(self, arrays: memoryview) -> None:
         self._arrays = arrays

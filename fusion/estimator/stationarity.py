@@ -6,8 +6,8 @@ unknown direction. The wheels must turn by less than their encoders' quantum ove
 creeping robot would turn them by two.
 
 The noise in the test is that of the data sheet, or the vibration from differences of successive samples
-(von Neumann 1941, Ann. Math. Stat. 12(4)) where that is more, as of an idling engine; it has a ceiling, so
-that no ride on a lorry passes.
+(von Neumann 1941, Ann. Math. Stat. 12(4)) where that is more, as of an idling engine; it is capped, so
+that a ride on a lorry is no rest.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def likelihood_ratio(
 
 
 class StationarityDetector:
-    """Tells rest from motion at each keyframe.
+    """Detects rest at each keyframe.
 
     Attributes:
         window_s: length of the window, in which `CREEP_MPS` turns the wheels by more than two quanta.

@@ -65,7 +65,7 @@ def steered_turn(rig: Rig, inputs: SensorConfig) -> SteeredTurn | None:
 
 
 class SteeredTurn:
-    """Turns by steering angles.
+    """Turns from steering angles.
 
     Attributes:
         mean: (2,) scale and zero (1/m). covariance: (2, 2) of them.

@@ -1,4 +1,4 @@
-"""A yaw gyro whose reading does not change while the wheels turn otherwise: the wheels stand in for it."""
+"""Replaces a yaw gyro whose reading is stuck, while the wheels show another turn, by the wheels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise that the wheels themselves show: stamps that jitter, and counters read out of step with them.
+"""Wheel noise by jittering stamps, or counters read out of step with them, seen in the increments.
 
 A counter read a little early or late at the end of one increment is wrong by as much, with the other sign,
 at the beginning of the next. With position errors p of variance s^2 an increment has 2 s^2 and the second

@@ -3,6 +3,9 @@
 Rows of keyframe k are those of `Chain`: over k and k + 1, shape (m, 2 dim + 1), the last column being the
 right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim rows, left free), the
 linear states' steps, the wheels (4), then whatever else a keyframe has.
+
+For speed the scalar factors of `Chain` are repeated here on arrays; tests/fusion/graph/test_batch.py compares
+both on random states.
 """
 
 import functools
