@@ -1,4 +1,4 @@
-"""The numbers of a robot that its own fixes can tell, and how well they are known beforehand."""
+"""The numbers of a robot that its own fixes determine, and their priors."""
 
 from __future__ import annotations
 

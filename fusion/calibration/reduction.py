@@ -304,7 +304,7 @@ class Reduction:
 def _inflation(left: Array) -> float:
     """Factor on the variance of fixes, for residuals (F, 2) that do not scatter from one fix to the next.
 
-    With a correlation r of successive ones, n of them tell of a constant what n (1 - r) / (1 + r) independent
+    With a correlation r of successive ones, n of them determine a constant as n (1 - r) / (1 + r) independent
     ones do (Bartlett 1946, J. R. Stat. Soc. Suppl. 8).
     """
     size = np.hypot(left[:, 0], left[:, 1])

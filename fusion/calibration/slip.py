@@ -2,7 +2,7 @@
 
 The smoother takes the ratios of nodes as independent about the wheel scale. Their expected squares give the
 spread (expectation maximisation), and their expected products the correlation from one node to the next,
-where they are known: a node of which the fixes tell the share g of its variance counts by g.
+where they are known: a node counts by the share g of its variance that the fixes determine.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ LEAST_SHARE = 0.5
 
 
 LEARNED_S = 10.0
-"""Time over which moves tell of sigma (assumed: much longer than white errors last)."""
+"""Time over which moves determine sigma (assumed: much longer than white errors last)."""
 PRIOR_MOVES, MOST_MOVES = 3.0, 30.0
 """Moves for which the data sheet counts, and those that are remembered (assumed)."""
 LARGEST_MOVE = 4.0

@@ -204,7 +204,7 @@ class Estimator:
             self.weights.external(t, probabilities)
 
     def add_command(self, t_ns: int, v_mps: float) -> None:
-        """Commanded forward speed, which tells a stalled robot from a waiting one."""
+        """Commanded forward speed; it distinguishes a stalled robot from a waiting one."""
         if (t := self.newest.admitted(t_ns, "command")) is not None:
             self.monitor.command(t, as_number(v_mps, "speed", "command"))
 

@@ -34,7 +34,7 @@ KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 """Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 UNKNOWN_HEIGHT_SIGMA_M = 1e6
-"""1 sigma of a height that is not known: no number of such fixes may come to tell one."""
+"""1 sigma of an unknown height: even many such fixes must not determine it."""
 UNKNOWN_CLIMB_MPS = 100.0
 """1 sigma of the upward velocity of a receiver that reports speed and course alone."""
 UNUSED_WEIGHT = 0.01
@@ -339,8 +339,8 @@ class GnssUpdater:
         own_m2 = np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
         horizontal += own_m2
         verdict, nis = self._gated(chain, k, innovation[:2], P[:2, :2])
-        slid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
-        if slid and not again and self._test_wheels(chain, k, fix, noise):
+        may_skid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
+        if may_skid and not again and self._test_wheels(chain, k, fix, noise):
             return self._add_fix(chain, k, fix, noise, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not GateDecision.REACQUIRE:

@@ -34,7 +34,7 @@ MEMORY_S = 10.0
 FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
 COARSE_M2 = 1.0
-"""Variance of a fix, both axes, that tells little of a skid: .7 m each (assumed)."""
+"""Variance of a fix, both axes, above which it shows little of a skid: .7 m each (assumed)."""
 LEAST_GAP_S = 0.1
 """Time from the last used fix over which a velocity carries the robot to a rejected one, at least."""
 DRIVING_MPS = 0.3

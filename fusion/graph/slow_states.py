@@ -122,7 +122,7 @@ def inflate_slip_covariance(
     """Restart the share `switch` of the slip, spread evenly over the keyframes since `t_ns` that are held.
 
     A change of ground is detected late; until then the measurements were explained by a speed that fits
-    the old slip. Spread out, the IMU tells when the speed changed.
+    the old slip. With the restart spread out, the IMU shows when the speed changed.
     """
     k = chain.at_or_after(t_ns)
     k = chain.first + 1 if k is None else max(k, chain.first + 1)

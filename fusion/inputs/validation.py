@@ -121,7 +121,7 @@ def checked_fix(
     A sigma that is missing, NaN, below 1 mm or above 1 km is replaced by that of the class of fix
     (`ASSUMED_SIGMA_M`; up twice as much). Without a class, less than 1 mm is taken for 1 mm, and a fix of
     more than 1 km is none. A velocity without a positive sigma has `ASSUMED_VELOCITY_SIGMA_MPS`, one without
-    its upward part tells of the others; a height without a sigma is free.
+    its upward part measures the others; a height without a sigma is free.
 
     Raises:
         DataError: no time, no east or north, an unknown class of fix, neither sigma nor class, or a

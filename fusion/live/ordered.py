@@ -1,7 +1,7 @@
 """Samples in the order of `Recording.messages()`, whatever the order in which a robot sends them.
 
-A sample waits until the IMU (or, without one, the wheels) is ahead of it by a little. Samples that come later
-than that are passed on at once: the estimator copes with them, but its result is then not that of a replay.
+A sample waits until the IMU is a little ahead of it. Samples that come later than that are passed on at once:
+the estimator copes with them, but its result is then not that of a replay.
 """
 
 import heapq
