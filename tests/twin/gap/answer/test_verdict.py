@@ -96,6 +96,12 @@ def test_a_stronger_ground_is_a_parameter() -> None:
     assert verdict({("soil_strength",): 60.0}).kind == "parameters"
 
 
+def test_a_ground_that_a_missing_effect_resembles_is_ambiguous() -> None:
+    alike = verdict({("soil_strength",): 60.0, ("mass",): 59.8})
+    assert alike.kind == "ambiguous"
+    assert alike.sets[0].effects == ("soil_strength", "mass")
+
+
 def test_sigma_holds_how_wrong_a_law_is() -> None:
     causes = {c.effect: c for c in verdict({("mass",): 60.0}).causes}
     assert causes["mass"].sigma[0] == pytest.approx(np.hypot(0.1, 0.1 * 2.0))
