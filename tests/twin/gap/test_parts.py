@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.twin.calibrate.inputs import DT_S
+from terrafusion.twin.calibrate.predict import predict
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
@@ -21,7 +22,13 @@ from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
 from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout import batch
-from terrafusion.twin.gap.rollout.batch import assign_graphs, effect_groups, motion_effects
+from terrafusion.twin.gap.rollout.batch import (
+    SampledSensors,
+    assign_graphs,
+    effect_groups,
+    make_lanes,
+    motion_effects,
+)
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import (
     Rollout,
@@ -31,7 +38,8 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     predictions,
 )
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.runs import run
+from terrafusion.twin.simulate import simulate
+from tests.twin.gap.runs import DRIVE, run
 
 CANDIDATES = Candidates.of()
 
@@ -270,8 +278,24 @@ def test_scores_are_those_of_the_whole_covariance(log_and_model) -> None:
     )
 
 
-def test_what_a_vehicle_is_built_like_is_no_cause() -> None:
-    """The Husky's coupled wheels are in its twin, not among what may be missing from it."""
+def test_what_a_vehicle_is_built_like_is_in_its_twin_and_no_cause() -> None:
+    """The Husky's coupled wheels: the diagnosis's twin drives as that of the calibration does. With more load
+    on the front axle, other wheels would turn differently."""
     husky = load_vehicle("husky")
+    husky = dataclasses.replace(husky, body=dataclasses.replace(husky.body, cg_forward_m=0.1))
     assert husky.effects
-    assert Candidates.of(None, husky.effects).keys == Candidates.of(None).keys
+    candidates = Candidates.of(None, husky.effects)
+    assert candidates.keys == Candidates.of(None).keys
+    recording = dataclasses.replace(simulate(DRIVE, vehicle=husky, seed=1), truth=None, truth_channels=())
+    (log,), model, _ = prepared([recording], husky, None)
+    for group in (*effect_groups(candidates), ()):
+        (lane,) = make_lanes([(log, {}, log.start)], model, candidates, group)
+        assert lane.plant.effects.items() >= husky.effects.items()
+    sensors = SampledSensors(log, model, candidates, log.samples())
+    assert {*sensors._graph_effects({}, ())} >= husky.effects.keys()
+    (found,) = predictions([Rollout(log, {})], model, candidates)
+    assert found is not None
+    fine = channel_sensitivities(log, linearise(log, model, candidates, log.start, ()))
+    for observed, a, b, c in zip(log.observed, predict(log, model, (), log.start), found, fine, strict=True):
+        for mine in (b, c.value):
+            assert np.sqrt(np.mean(((a.value - mine) / observed.sigma) ** 2)) < 0.05, observed.channel

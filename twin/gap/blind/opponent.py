@@ -55,7 +55,7 @@ class _Fit:
     def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> WhitenedRun:
         """A log against the twin with parameters x, the pose at each window's start projected out."""
         effects = dict(zip(self.keys, (x * self.scale).tolist(), strict=True))
-        model = dataclasses.replace(self.model, effects=effects)
+        model = dataclasses.replace(self.model, effects={**self.model.effects, **effects})
         run = linearise(log, model, self.candidates, log.start, None if derivatives else ())
         found = channel_sensitivities(log, run)
         found = moved_to(log, found, log.start, aligned_start(log, [s.value for s in found], log.start))

@@ -80,8 +80,8 @@ def gather_evidence(
         DataError: a log lacks a channel that is needed.
         TerrafusionError: the twin diverges on every reference.
     """
-    jobs, R = jobs if is_thread_safe(candidates) else 1, len(runs)
     logs, model, notes = prepared([*runs, *references], vehicle, soils, source)
+    jobs, R = jobs if is_thread_safe(model, candidates) else 1, len(runs)
     channels = tuple(o.channel for o in logs[0].observed)
     known = {} if cache is None else cache
     if references:

@@ -78,17 +78,24 @@ def assign_graphs(candidates: Candidates, runs: Sequence[MotionEffects]) -> dict
     return {candidates.moving: list(range(len(runs)))}
 
 
-def is_thread_safe(candidates: Candidates) -> bool:
+def other_effects(model: Model, candidates: Candidates) -> dict[str, float]:
+    """Effects of the twin that are no candidates, such as how its chassis is built: in every graph."""
+    return {k: v for k, v in model.effects.items() if v != 0.0 and k not in candidates.keys}
+
+
+def is_thread_safe(model: Model, candidates: Candidates) -> bool:
     """Whether everything that drives the twin is compiled; CasADi's virtual machine is not thread-safe.
 
     Effects of the catalogue are compiled where there is a compiler; registered ones may not be expressible in
     C.
     """
-    if codegen.follows_from("", candidates.keys) is not None:
+    others = other_effects(model, candidates)
+    keys = tuple(sorted({*candidates.keys, *others}))
+    if codegen.follows_from("", keys) is not None:
         return compiled()
     lanes = LANES_32 if SINGLE_PRECISION else LANES
-    full = Variant(lanes, candidates.moving, fixed_ground=True)
-    return driver(full) is not None and reader(tuple(sorted(candidates.keys)), True) is not None
+    full = Variant(lanes, tuple(sorted({*candidates.moving, *others})), fixed_ground=True)
+    return driver(full) is not None and reader(keys, True) is not None
 
 
 def motion_effects(candidates: Candidates, effects: Effects) -> MotionEffects:
@@ -112,14 +119,14 @@ def make_lanes(
     candidates: Candidates,
     group: Sequence[str],
 ) -> list[Lane]:
-    """Lanes of (log, effects, poses (W, 3)); effects of the group and of the soil are in the graph. Lanes
-    with equal inputs share the array."""
+    """Lanes of (log, effects, poses (W, 3)); effects of the group, of the soil and those of the model that
+    are no candidates are in the graph. Lanes with equal inputs share the array."""
     scales = dict(zip(candidates.keys, candidates.scale, strict=True))
-    dead_time = VEHICLE_PARAMETERS.index("dead_time_applied_s")
+    dead_time, others = VEHICLE_PARAMETERS.index("dead_time_applied_s"), other_effects(model, candidates)
     bases, inputs, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
     for log, effects, start in runs:
         if id(log) not in bases:
-            bases[id(log)] = plant_of(log, dataclasses.replace(model, effects={}))
+            bases[id(log)] = plant_of(log, dataclasses.replace(model, effects=others))
         base = bases[id(log)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
@@ -128,7 +135,8 @@ def make_lanes(
         delay_s = _input_delay_s(log, model, effects)
         if (id(log), delay_s) not in inputs:
             inputs[id(log), delay_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, delay_s))
-        out.append(Lane(log, Plant(vehicle, base.route, present), inputs[id(log), delay_s], start))
+        plant = Plant(vehicle, base.route, {**base.effects, **present})
+        out.append(Lane(log, plant, inputs[id(log), delay_s], start))
     return out
 
 
@@ -194,7 +202,8 @@ class SampledSensors:
     """Sensor readings at samples (N,) of the runs of one log."""
 
     def __init__(self, log: PreparedLog, model: Model, candidates: Candidates, samples: Indices) -> None:
-        self.keys, self.samples = frozenset(candidates.keys), samples
+        self.others, self.samples = frozenset(other_effects(model, candidates)), samples
+        self.keys = frozenset(candidates.keys) | self.others
         self.sensing = self.keys - {*candidates.moving} | {*SOIL_KEYS} & self.keys
         self.mounting = mounting_vector(model.vehicle)
         route = route_of(log, model)
@@ -208,6 +217,7 @@ class SampledSensors:
         """Outputs (N, Y) of the states (N, X) of a run with these inputs.
 
         Args:
+            effects: all of the run, the model's own included.
             group: effects that share a graph with those of the run; where it lacks one, a larger graph is
                 used.
         """
@@ -226,7 +236,7 @@ class SampledSensors:
     def _graph_effects(self, effects: Effects, group: Sequence[str]) -> tuple[str, ...]:
         """Effects of the smallest graph that has all of a run's."""
         present = {k for k, value in effects.items() if value != 0.0} & self.keys
-        for some in ({*group, *SOIL_KEYS} & self.keys, self.sensing):
+        for some in ({*group, *SOIL_KEYS} & self.keys | self.others, self.sensing):
             if present <= some:
                 return tuple(sorted(some))
         return tuple(sorted(self.keys))
