@@ -22,7 +22,6 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.infer.refit import effects_at
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 
@@ -106,7 +105,7 @@ def estimator_gap(
     groups = [scores(references), scores(runs), scores(twins({})), []]
     fit = found.verdict.fit
     if fit is not None:
-        groups[-1] = scores(twins(effects_at(found.evidence, fit.columns, fit.value)))
+        groups[-1] = scores(twins(found.evidence.candidates.changed(fit.columns, fit.value)))
     names = dict.fromkeys(name for group in groups for one in group for name in one)
     return [Compared(name, *(_mean(group, name) for group in groups)) for name in names], failed
 

@@ -419,6 +419,14 @@ def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Gap
     assert values_of(found)["cross_slope/uniform"] < -0.07  # these runs are on level ground
 
 
+def test_what_the_twin_has_may_have_gone() -> None:
+    """Lost counts are never negative, but there can be fewer than the twin has."""
+    on_it = dataclasses.replace(VEHICLE, effects={"encoder_dropout/share": 0.06})
+    found = diagnose(runs(330, 2), [], on_it, effects=("encoder_dropout", "gyro_bias"))
+    assert found.verdict.named == ("encoder_dropout",)
+    assert values_of(found)["encoder_dropout/share"] == pytest.approx(-0.06, abs=0.01)
+
+
 @pytest.mark.parametrize("effects", [("gyro_bias",), None])
 def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tuple[str, ...] | None) -> None:
     """Also where all candidates are of the sensors."""

@@ -16,7 +16,7 @@ from terrafusion.twin.effects.alternative_terramechanics import second_terramech
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.gap.answer.verdict import null_probability
 from terrafusion.twin.gap.answer.where import permutations
-from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.candidates import RANGE_SHARE, SMALLEST, Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
@@ -238,6 +238,20 @@ def test_an_effect_of_ones_own_takes_part() -> None:
     assert "trailer" in own.effects
     assert "trailer/drag" in own.moving
     assert own.hypotheses[-1].columns == (own.keys.index("trailer/drag"),)
+
+
+def test_what_the_twin_has_can_also_be_less() -> None:
+    """Between the ends of the range, from its own value; no side is shorter than the least size sought."""
+    keys = ("slip_sinkage/linear", "motion_resistance/rolling", "wheel_radius/scale")
+    at = [CANDIDATES.keys.index(key) for key in keys]
+    scale, high = CANDIDATES.scale[at], RANGE_SHARE * CANDIDATES.high[at] / CANDIDATES.scale[at]
+    low, _ = CANDIDATES.bounds(at)
+    assert low[0] == low[1] == 0.0
+    beside = CANDIDATES.beside(dict(zip(keys, scale * [4.0, 0.5 * SMALLEST, high[2]], strict=True)))
+    low, end = beside.bounds(at)
+    np.testing.assert_allclose(low, [-4.0, 0.0, -2.0 * high[2]])
+    np.testing.assert_allclose(end, [high[0] - 4.0, high[1] - 0.5 * SMALLEST, 0.0], atol=1e-9)
+    assert beside.changed(at[:1], low[:1]) == {keys[0]: pytest.approx(0.0, abs=1e-12)}
 
 
 def test_other_terramechanics_are_no_candidate_unless_asked_for() -> None:

@@ -112,14 +112,15 @@ class GapDiagnosis:
 
 
 def _cause(evidence: GapEvidence, cause: Cause) -> dict[str, Any]:
-    c, parameters = evidence.candidates, {}
-    for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
-        base, shift = evidence.model.effects.get(c.keys[i], 0.0), float(value * c.scale[i])
-        parameters[c.keys[i]] = {
-            "value": min(max(base + shift, float(c.low[i])), float(c.high[i])) - base,
+    c, changed = evidence.candidates, evidence.candidates.changed(cause.columns, cause.value)
+    parameters = {
+        c.keys[i]: {
+            "value": changed[c.keys[i]] - float(c.base[i]),
             "sigma": finite(float(sigma * c.scale[i])),
             "unit": c.units[i],
         }
+        for i, sigma in zip(cause.columns, cause.sigma, strict=True)
+    }
     return {
         "effect": cause.effect,
         "class": list(cause.members),

@@ -13,7 +13,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.answer.verdict import EffectFit
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitened_errors
+from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
@@ -114,8 +114,8 @@ def _errors_left_out(
     """Errors of each run with the effect fitted to the other runs."""
     if fit is None:
         return was
-    values = enumerate(fit.left_out)
-    tried = [RunWithEffects(i, effects_at(evidence, fit.columns, value)) for i, value in values]
+    changed, values = evidence.candidates.changed, enumerate(fit.left_out)
+    tried = [RunWithEffects(i, changed(fit.columns, value)) for i, value in values]
     errors = zip(evidence.runs, whitened_errors(evidence, tried), was, strict=True)
     return [before if e is None else e - run.by_parameter @ robot.mean for run, e, before in errors]
 

@@ -120,7 +120,7 @@ def first_forms(every: Candidates) -> Candidates:
     return Candidates(
         keys, every.scale[columns], every.low[columns], every.high[columns],
         tuple(every.units[i] for i in columns), tuple(hypotheses),
-        tuple(k for k in every.moving if k in keys), every.world_fixed & {*keys},
+        tuple(k for k in every.moving if k in keys), every.world_fixed & {*keys}, np.zeros(len(keys)),
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ its typical size (`scale` of the catalogue), so that all columns are comparable.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -18,6 +18,7 @@ from terrafusion.twin.effects.form import Form
 SOIL_STRENGTH = "soil_strength"
 """The effect that is a known parameter of the soil, not missing physics: verdict `parameters`."""
 RANGE_SHARE = 0.98  # share of its range within which a parameter is sought
+SMALLEST = 0.1  # least size that is sought, in typical ones
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Candidates:
         hypotheses: the forms, in the order of the catalogue.
         moving: keys that change the robot's motion, sorted as the engine expects them.
         world_fixed: those of `moving` that depend on position or heading in the world.
+        base: (K,) the twin's own values, in the parameters' units: a candidate is a change of them.
     """
 
     keys: tuple[str, ...]
@@ -50,6 +52,7 @@ class Candidates:
     hypotheses: tuple[Hypothesis, ...]
     moving: tuple[str, ...]
     world_fixed: frozenset[str]
+    base: Array
 
     @classmethod
     def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Self:
@@ -86,8 +89,12 @@ class Candidates:
             keys, np.array([p.scale for p in numbers]), np.array([p.low for p in numbers]),
             np.array([p.high for p in numbers]), tuple(p.unit for p in numbers), tuple(forms),
             tuple(sorted(key for key in keys if moves(key))),
-            frozenset(key for key in keys if known[key][0].world_fixed()),
+            frozenset(key for key in keys if known[key][0].world_fixed()), np.zeros(len(keys)),
         )  # fmt: skip
+
+    def beside(self, effects: Mapping[str, float]) -> Self:
+        """As changes of a twin that has these effects already."""
+        return replace(self, base=np.array([effects.get(key, 0.0) for key in self.keys]))
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -99,7 +106,16 @@ class Candidates:
         return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 
     def bounds(self, columns: Sequence[int]) -> tuple[Array, Array]:
-        """Least and greatest values (k,) of some columns, in typical sizes."""
+        """Least and greatest changes (k,) of some columns, in typical sizes: zero where there is no room for
+        `SMALLEST`."""
         at = list(columns)
-        scale = self.scale[at]
-        return RANGE_SHARE * self.low[at] / scale, RANGE_SHARE * self.high[at] / scale
+        base, scale = self.base[at], self.scale[at]
+        low, high = (RANGE_SHARE * end[at] / scale - base / scale for end in (self.low, self.high))
+        return np.where(low <= -SMALLEST, low, 0.0), np.where(high >= SMALLEST, high, 0.0)
+
+    def changed(self, columns: Sequence[int], change: Array) -> dict[str, float]:
+        """The twin's parameters by key with a change (k,) of some, in typical sizes, within their ranges."""
+        return {
+            self.keys[i]: float(np.clip(self.base[i] + x * self.scale[i], self.low[i], self.high[i]))
+            for i, x in zip(columns, change, strict=True)
+        }

@@ -17,7 +17,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.infer.refit import RunWithEffects, effects_at, whitened_errors
+from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.delay import DELAYS
 
@@ -121,7 +121,8 @@ class SignatureBank:
     def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> SignatureBank:
         """With further sizes of laws; those at which the twin diverges are left out."""
         runs = range(len(evidence.runs))
-        effects = [effects_at(evidence, p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
+        changed = evidence.candidates.changed
+        effects = [changed(p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
         tried = [RunWithEffects(r, e, p.soils[r]) for p, e in zip(points, effects, strict=True) for r in runs]
         plain = {(r, p.soils[r].tobytes()): RunWithEffects(r, {}, p.soils[r]) for p in points for r in runs}
         # Unclipped: a large effect is no outlier.

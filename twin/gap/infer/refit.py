@@ -6,23 +6,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numpy as np
-
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import whitened_error
 from terrafusion.twin.gap.rollout.run_soil import referred_to_model, with_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
-
-
-def effects_at(evidence: GapEvidence, columns: Sequence[int], value: Array) -> dict[str, float]:
-    """Parameters by key of coefficients in typical sizes, on top of the twin's own, within their ranges."""
-    c = evidence.candidates
-    out = {}
-    for i, v in zip(columns, value, strict=True):
-        base = evidence.model.effects.get(c.keys[i], 0.0)
-        out[c.keys[i]] = float(np.clip(base + v * c.scale[i], c.low[i], c.high[i]))
-    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.data.candidates import SMALLEST, Candidates, Hypothesis
 from terrafusion.twin.gap.infer.bank import Ladder, is_simulated
 from terrafusion.twin.gap.infer.predictive import Metric
 
-SMALLEST = 0.1  # least size, typical ones, of the prior, which is uniform in the logarithm
 RIDGE = 1e-3  # information on a size before the runs: 1 sigma is 30 typical sizes
 SWEEPS, ENOUGH = 25, 1e-3  # most rounds of a joint fit, and the gain that ends it
 
@@ -144,7 +143,7 @@ class Laws:
         self, m: Metric, laws: Sequence[int], values: Sequence[Array]
     ) -> tuple[float, tuple[Array, ...]]:
         """Log of the share of the prior of the sizes that is as good as the best, and the covariance of each
-        law's."""
+        law's. The prior is uniform in the logarithm of the size, from `SMALLEST` on."""
         C = [self._slope(m, i, v) for i, v in zip(laws, values, strict=True)]
         H = np.column_stack(C).T @ m.K @ np.column_stack(C)
         H += RIDGE * np.eye(len(H))

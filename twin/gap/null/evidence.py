@@ -37,7 +37,7 @@ class GapEvidence:
 
     Attributes:
         model: the twin, its soil set to the references.
-        candidates: effects.
+        candidates: effects, as changes of that twin's.
         channels: observed channels.
         noise: of each channel.
         runs, references: whitened residuals of each.
@@ -86,6 +86,7 @@ def gather_evidence(
     known = {} if cache is None else cache
     if references:
         model = set_soil(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
+    candidates = candidates.beside(model.effects)
     linearised, done = LinearisationCache(model, candidates, known), itertools.count(1)
 
     def count() -> None:
