@@ -79,6 +79,8 @@ def verdict_line(d: GapDiagnosis) -> str:
         return f"Gap of unknown cause: no effect of the catalogue explains it ({certain})."
     certain = f"{percent(sets[0].probability)} certain" if sets else "not certain"
     if verdict.kind == "parameters":
+        own = next(c.probability for c in verdict.causes if c.effect in verdict.named)
+        certain = f"{percent(own)} certain"  # not of what it resembles
         return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
     if len(sets) > 1:
         both = "; and ".join(map(alternatives_text, sets))

@@ -125,7 +125,8 @@ def judge(
         return GapVerdict("unknown", (), causes, loose, p_null, p_unknown, None)
     named = tuple(c.effect for c in causes if c.effect in best)
     kind = "ambiguous" if any(len(members) > 1 for members in classes.values()) else "effect"
-    kind = "parameters" if classes == {SOIL_STRENGTH: (SOIL_STRENGTH,)} else kind
+    likely = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
+    kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
     return GapVerdict(kind, named, causes, credible, p_null, p_unknown, _fit(found, found.fits[best]), odds)
 

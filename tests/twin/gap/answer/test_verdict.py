@@ -100,6 +100,9 @@ def test_a_ground_that_a_missing_effect_resembles_is_ambiguous() -> None:
     alike = verdict({("soil_strength",): 60.0, ("mass",): 59.8})
     assert alike.kind == "ambiguous"
     assert alike.sets[0].effects == ("soil_strength", "mass")
+    unlikely = verdict({("soil_strength",): 60.0, ("mass",): 50.0}, alike={"soil_strength": {"mass"}})
+    assert unlikely.kind == "parameters"
+    assert unlikely.sets[0].effects == ("soil_strength", "mass")
 
 
 def test_sigma_holds_how_wrong_a_law_is() -> None:
