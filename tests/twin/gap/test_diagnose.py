@@ -57,7 +57,9 @@ def checked(d: GapDiagnosis) -> dict:
     jsonschema.validate(answer, SCHEMA)
     probabilities = [c["probability"] for c in answer["causes"]]
     assert probabilities == sorted(probabilities, reverse=True)
-    assert sum(probabilities) + answer["p_unknown"] + answer["p_null"] == pytest.approx(1.0, abs=1e-6)
+    present = 1.0 - answer["p_unknown"] - answer["p_null"]  # of one effect, or of two together
+    assert probabilities[0] <= present + 1e-6
+    assert present - 1e-6 <= sum(probabilities) <= 2.0 * present + 1e-6
     return answer
 
 

@@ -31,7 +31,7 @@ class Cause:
 
     Attributes:
         effect, members: its name, and those of its credible set (itself first).
-        probability: of it; of effects that act together each has an equal part.
+        probability: that it is present, alone or with others.
         columns, value, sigma: (k,) its best law, in units of `Candidates.scale`.
         share: of what all effects explain together.
     """
@@ -183,7 +183,7 @@ def _causes(
     weight = dict.fromkeys(candidates.effects, 0.0)
     for name, p in sets.items():
         for effect in name:
-            weight[effect] += p / len(name)
+            weight[effect] += p
     most = max(fit.gain for fit in found.fits.values())
     out = []
     for effect in sorted(weight, key=lambda effect: (-weight[effect], candidates.effects.index(effect))):

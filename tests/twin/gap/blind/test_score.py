@@ -67,7 +67,7 @@ def test_guesses_score_at_chance_and_their_confidence_is_honest() -> None:
 
 
 def test_the_certainty_judged_is_that_of_the_credible_set_as_the_reader_sees_it() -> None:
-    """Effects that act together share the probability of a cause; that one of them is present is certain."""
+    """Not that of the causes in it, which may act together."""
     trial = one(PLAIN, "same")
     (effect,) = trial.effects()
     answer = fake.diagnosis("effect", [(effect, 0.5), ("another", 0.5)], [effect, "another"])
