@@ -136,7 +136,7 @@ def _pairs(judged: Sequence[Judged]) -> dict[str, Any]:
         if j.trial.part_of:
             alone.setdefault(j.trial.part_of, []).append(j.detected)
     pairs = _of(judged, "pair")
-    fair = [j for j in pairs if all(alone.get(j.trial.trial, [False]))]
+    fair = [j for j in pairs if sum(alone.get(j.trial.trial, ())) == len(j.trial.effects())]
     return {
         "both": _rate(fair, lambda j: j.found == 2),
         "both_of_all": _rate(pairs, lambda j: j.found == 2),

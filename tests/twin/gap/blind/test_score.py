@@ -88,6 +88,8 @@ def test_a_pair_counts_where_both_effects_are_seen_alone() -> None:
     found = figures(trials, overlooks)["pairs"]
     assert (found["both"]["hits"], found["both"]["count"]) == (len(pairs) - 1, len(pairs) - 1)
     assert found["both_of_all"]["count"] == len(pairs)
+    one_alone = [t for t in trials if t.trial != blind_to]  # its other single trial is not there yet
+    assert figures(one_alone, fake.perfect)["pairs"]["both"]["count"] == len(pairs) - 1
 
 
 def test_sizes_are_compared_with_the_truth_in_their_sigma() -> None:
