@@ -55,12 +55,17 @@ def _updated(
 ) -> dict[str, Any]:
     out = copy.deepcopy(raw)
     for name, f in fitted.items():
-        section, parts = out, name.split(".")
-        for part in parts[:-1]:
-            section = section.setdefault(part, {})
-        section[parts[-1]] = _entry(section.get(parts[-1]), f.value, _source(f, logs))
+        set_number(out, name, f.value, _source(f, logs))
     _overridden(out, values)
     return out
+
+
+def set_number(raw: dict[str, Any], name: str, value: float, source: str) -> None:
+    """Put a number at a dotted name; its range `valid` is dropped where the number lies outside."""
+    *sections, last = name.split(".")
+    for section in sections:
+        raw = raw.setdefault(section, {})
+    raw[last] = _entry(raw.get(last), value, source)
 
 
 def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:

@@ -1,11 +1,10 @@
 """Writes a vehicle file with the effects found: as numbers that it has, or in its section `effects`."""
 
 import copy
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.twin.calibrate.files import mark_measured, write_yaml
+from terrafusion.twin.calibrate.files import mark_measured, set_number, write_yaml
 from terrafusion.twin.effects.catalogue import lookup
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -77,13 +76,6 @@ def _change_field(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: s
     for part in path.split("."):
         before = getattr(before, part)
     after = float(_CHANGES[how](before, value))
-    *sections, last = path.split(".")
-    section: Any = raw
-    for part in sections:
-        section = section.setdefault(part, {})
-    old = section.get(last)
-    source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
-    valid: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
-    section[last] = {"value": after, **valid, "source": source}
+    set_number(raw, path, after, f"gap diagnosis: {value:+.4g} on {before:.6g}")
     mark_measured(raw, path)
     return f"{path}: {before:.6g} -> {after:.6g}"
