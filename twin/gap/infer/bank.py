@@ -25,7 +25,8 @@ INSENSITIVE = 10.0
 """A law is insensitive where its sensitivity, at the end of its range, makes a smaller square in all runs;
 32-bit rounding makes 3 at most (docs/how-to/gap.md)."""
 APART = 0.15
-"""A simulated size takes the place of others nearer than this share of it, where runs were on other soils."""
+"""A simulated size takes the place of others that differ by less than this share, where runs were on other
+soils; the end of a law's range is then simulated there as well."""
 THRESHOLDS = (0.4, 0.7, 1.0)
 """Sizes of an insensitive law, in that of its range: it acts beyond a threshold, if at all."""
 
@@ -119,7 +120,8 @@ class SignatureBank:
         ]
 
     def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> SignatureBank:
-        """With further sizes of laws; those at which the twin diverges are left out."""
+        """With further sizes of laws, the first of near ones, without those at which the twin diverges."""
+        points = self._with_ends(points)
         runs = range(len(evidence.runs))
         changed = evidence.candidates.changed
         effects = [changed(p.law.columns, p.size * np.ones(len(p.law.columns))) for p in points]
@@ -128,17 +130,34 @@ class SignatureBank:
         # Unclipped: a large effect is no outlier.
         errors = whitened_errors(evidence, [*tried, *plain.values()], clip=False)
         without = dict(zip(plain, errors[len(tried) :], strict=True))
-        signatures = dict(self.signatures)
+        signatures, simulated = dict(self.signatures), dict[Hypothesis, dict[float, list[Array]]]()
         for i, point in enumerate(points):
             with_it = errors[i * len(runs) : (i + 1) * len(runs)]
             pairs = [(without[r, point.soils[r].tobytes()], with_it[r]) for r in runs]
             new = [whole - error for whole, error in pairs if whole is not None and error is not None]
             if len(new) == len(runs):
-                near = APART * abs(point.size)
-                known = signatures.get(point.law, {})
-                apart = {size: s for size, s in known.items() if abs(size - point.size) >= near}
-                signatures[point.law] = {**apart, point.size: new}
+                simulated.setdefault(point.law, {})[point.size] = new
+        for law, sizes in simulated.items():
+            known = signatures.get(law, {})
+            apart = {x: s for x, s in known.items() if not any(_near(x, size) for size in sizes)}
+            signatures[law] = {**apart, **sizes}
         return dataclasses.replace(self, signatures=signatures)
+
+    def _with_ends(self, points: Sequence[SimulatedSize]) -> list[SimulatedSize]:
+        """The points but for those near an earlier one, and the ends of a ladder beyond a near point."""
+        out = list[SimulatedSize]()
+        for p in points:
+            if not any(p.law == other.law and _near(p.size, other.size) for other in out):
+                out.append(p)
+        for p in list(out):
+            ends = self.sizes(p.law)[[0, -1]].tolist() if p.law in self.signatures else []
+            beyond = [end for end in ends if _near(end, p.size) and abs(end) > abs(p.size)]
+            out += [dataclasses.replace(p, size=end) for end in beyond]
+        return out
+
+
+def _near(a: float, b: float) -> bool:
+    return abs(a - b) < APART * max(abs(a), abs(b))
 
 
 def model_soil(evidence: GapEvidence) -> list[Array]:

@@ -119,8 +119,8 @@ class _Explainer:
             law = look.laws.names[i]
             if law in look.bank.signatures:
                 known = look.bank.sizes(law)
-                new = {*some, float(np.clip(GROWTH * some[0], known[0], known[-1]))}
-                points += [SimulatedSize(law, x, soils) for x in sorted(new) if abs(x) > LEAST_SIZE]
+                new = [*some, float(np.clip(GROWTH * some[0], known[0], known[-1]))]
+                points += [SimulatedSize(law, x, soils) for x in new if abs(x) > LEAST_SIZE]
         return look.bank.with_sizes(self.evidence, points)
 
     def with_best_sizes(
