@@ -92,7 +92,7 @@ class Deviations:
     @classmethod
     def of(cls, A: Array, parts: Sequence[Array], references: float, candidates: Candidates) -> Deviations:
         """Of scores with the information A (P, P) and a covariance in three `parts`: what is known, change on
-        other drives, and scatter from run to run, known from so many references."""
+        other drives, and scatter from run to run, known from so many references, three at least."""
         blocks = _blocks(A, sum(parts[1:], parts[0]), candidates)
         maps, widths = np.hstack(blocks), [block.shape[1] for block in blocks]
         first = np.cumsum([0, *widths[:-1]])
@@ -101,7 +101,8 @@ class Deviations:
         inner = [[part[cell, cell] for part in every] for cell in cells]
         changes = _factors(CHANGE_FREEDOM) if parts[1].any() else (np.ones(1), np.ones(1))
         factors = changes, _factors(references)
-        mean = np.array([sum(np.trace(part) for part in own) for own in inner])
+        expected = 1.0, *(f / (f - 2.0) for f in (CHANGE_FREEDOM, references))  # of an inverse chi-squared
+        mean = np.array([np.dot(expected, [np.trace(part) for part in own]) for own in inner])
         tails = np.array([_log_tail(own, m, *factors) for own, m in zip(inner, mean, strict=True)])
         return cls(maps, first, mean, tails)
 

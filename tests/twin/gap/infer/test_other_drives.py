@@ -210,6 +210,7 @@ def test_tails_of_deviations_are_those_of_drawn_scores() -> None:
         for f, part in zip(factors, parts, strict=True)
     )
     squares = deviations.squares(scores)
+    np.testing.assert_allclose(squares.mean(axis=0), deviations.mean, rtol=0.1)
     for k in (0, P - 1, P + 1, squares.shape[1] - 1):
         for share in (0.1, 0.01):
             level = np.quantile(squares[:, k], 1.0 - share) / deviations.mean[k]
