@@ -167,7 +167,8 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
     if name == LIFTED:
         model = _lifted(model, label)
     elif PAYLOAD in name:
-        model = _with_mass(model, (1.0 + PAYLOAD_SHARE) * model.vehicle.body.mass_kg)
+        payload_kg = model.payload_kg + PAYLOAD_SHARE * model.vehicle.body.mass_kg
+        model = dataclasses.replace(model, payload_kg=payload_kg)
     t_s = DT_S * np.arange(round(scenario.duration_s / DT_S) + 1.0)
     prompt = dataclasses.replace(model.vehicle.drive, dead_time_s=0.0)  # the log's commands have none either
     _, inputs = open_loop(scenario, t_s, dataclasses.replace(model.vehicle, drive=prompt))
@@ -191,12 +192,9 @@ def _lifted(model: Model, label: str) -> Model:
     firm = load_soil("asphalt")
     shear = dataclasses.replace(firm.shear, friction_angle_rad=1e-6, friction_cap=1e-6)
     air = dataclasses.replace(firm, shear=shear, resistance=dataclasses.replace(firm.resistance, rolling=0.0))
-    return dataclasses.replace(_with_mass(model, STAND_MASS_KG), soils={**model.soils, label: air})
-
-
-def _with_mass(model: Model, mass_kg: float) -> Model:
-    body = dataclasses.replace(model.vehicle.body, mass_kg=mass_kg)
-    return dataclasses.replace(model, vehicle=dataclasses.replace(model.vehicle, body=body))
+    body = dataclasses.replace(model.vehicle.body, mass_kg=STAND_MASS_KG)
+    vehicle = dataclasses.replace(model.vehicle, body=body)
+    return dataclasses.replace(model, vehicle=vehicle, payload_kg=0.0, soils={**model.soils, label: air})
 
 
 def _empty(observed: Observed, end_s: float) -> Observed:

@@ -1,0 +1,44 @@
+"""The twin that drives what `next_run` tries."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.answer import next_run
+from terrafusion.twin.gap.answer.next_run import LIFTED, PAYLOAD, PAYLOAD_SHARE
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.logs import prepared
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
+from tests.twin.gap.runs import run
+
+
+class ModelSeenError(Exception):
+    """Ends a forecast once its model is known."""
+
+
+def test_a_payload_has_a_moment_of_inertia(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It spreads as the robot does; on a stand the wheels carry neither."""
+    seen: list[Model] = []
+
+    def linearise(log: Any, model: Model, *_: Any) -> None:
+        seen.append(model)
+        raise ModelSeenError
+
+    monkeypatch.setattr(next_run, "linearise", linearise)
+    (log,), model, _ = prepared([run(1)], load_vehicle("elevate"), None)
+    evidence: Any = SimpleNamespace(
+        runs=[SimpleNamespace(log=log)], model=model, candidates=Candidates.of(["mass"])
+    )
+    for name in ("speed staircase", "speed staircase" + PAYLOAD, LIFTED):
+        with pytest.raises(ModelSeenError):
+            next_run._forecast(evidence, name, {"mass"})
+    of = [m.vehicle_vector() for m in seen]
+    for name in ("mass_kg", "yaw_inertia_kgm2"):
+        at = VEHICLE_PARAMETERS.index(name)
+        assert of[1][at] == pytest.approx((1.0 + PAYLOAD_SHARE) * of[0][at])
+    assert of[2][VEHICLE_PARAMETERS.index("mass_kg")] == next_run.STAND_MASS_KG
