@@ -56,7 +56,7 @@ class GapDiagnosis:
     @property
     def references(self) -> tuple[str, ...]:
         """Names of the references."""
-        return tuple(r.name for r in self.evidence.references)
+        return self.evidence.reference_names
 
     @property
     def seconds(self) -> float:

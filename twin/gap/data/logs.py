@@ -24,15 +24,20 @@ def check_distinct(recordings: Sequence[Recording]) -> None:
     """
     known: dict[bytes, str] = {}
     for recording in recordings:
-        content = hashlib.sha256()
-        for name, channel in recording.channels().items():
-            content.update(name.encode() + channel.t_ns.tobytes())
-            for column in channel.columns().values():
-                content.update(column.astype(str).tobytes() if column.dtype == object else column.tobytes())
-        digest = content.digest()
-        if digest in known:
-            raise DataError(f"the same log as {known[digest]}", file=recording.name, remedy="give each once")
-        known[digest] = recording.name
+        content = digest(recording)
+        if content in known:
+            raise DataError(f"the same log as {known[content]}", file=recording.name, remedy="give each once")
+        known[content] = recording.name
+
+
+def digest(recording: Recording) -> bytes:
+    """Hash of the content of all channels."""
+    content = hashlib.sha256()
+    for name, channel in recording.channels().items():
+        content.update(name.encode() + channel.t_ns.tobytes())
+        for column in channel.columns().values():
+            content.update(column.astype(str).tobytes() if column.dtype == object else column.tobytes())
+    return content.digest()
 
 
 def prepared(

@@ -13,7 +13,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import prepared
+from terrafusion.twin.gap.data.logs import digest, prepared
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
@@ -40,7 +40,8 @@ class GapEvidence:
         candidates: effects, as changes of that twin's.
         channels: observed channels.
         noise: of each channel.
-        runs, references: whitened residuals of each.
+        runs, references: whitened residuals of each; references by their content, in whatever order given.
+        reference_names: in the order given.
         soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
         notes: assumptions, in sentences.
@@ -55,6 +56,7 @@ class GapEvidence:
     noise: dict[str, ResidualNoise]
     runs: list[WhitenedRun]
     references: list[WhitenedRun]
+    reference_names: tuple[str, ...]
     soil_limit: Array
     cache: LinearisationCache
     notes: tuple[str, ...]
@@ -80,6 +82,7 @@ def gather_evidence(
         DataError: a log lacks a channel that is needed.
         TerrafusionError: the twin diverges on every reference.
     """
+    names, references = tuple(r.name for r in references), sorted(references, key=digest)
     logs, model, notes = prepared([*runs, *references], vehicle, soils, source)
     jobs, R = jobs if is_thread_safe(model, candidates) else 1, len(runs)
     channels = tuple(o.channel for o in logs[0].observed)
@@ -114,6 +117,6 @@ def gather_evidence(
     clipped = limit_outliers(white[:R], white[R:], first_sigma, jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
-        model, candidates, channels, noise, *clipped, limit, linearised,
+        model, candidates, channels, noise, *clipped, names, limit, linearised,
         tuple(dict.fromkeys(notes)), more, jobs,
     )  # fmt: skip

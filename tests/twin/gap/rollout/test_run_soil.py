@@ -50,8 +50,10 @@ def test_a_search_that_steps_too_far_tries_a_shorter_step_and_is_the_same_for_ju
     found = gather_evidence(
         runs(990, 1), runs(990, 3), load_vehicle("elevate"), None, evidence.candidates, jobs=2
     )
-    assert all(run.soil.any() for run in residuals(found.references[:2]))
-    np.testing.assert_array_equal(*(run.soil for run in residuals([found.runs[0], found.references[0]])))
+    by_name = {run.name: run for run in found.references}
+    assert all(run.soil.any() for run in residuals([by_name["run990"], by_name["run991"]]))
+    same = [found.runs[0], by_name[found.runs[0].name]]
+    np.testing.assert_array_equal(*(run.soil for run in residuals(same)))
 
 
 def test_a_ground_beyond_its_range_is_neither_driven_nor_carried_back(evidence: GapEvidence) -> None:
