@@ -5,7 +5,7 @@ the wheels) and their derivatives continue from one window into the next, while 
 starts from a guess that the fit corrects. So no error of the pose accumulates.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import delayed_inputs
+from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 
 LEAD_S = 5.0
 """Run-up under the first input of a log, so that the twin starts in steady state."""
@@ -56,7 +57,7 @@ def predict(log: PreparedLog, model: Model, names: Sequence[str], start: Array) 
     """
     plant = plant_of(log, model)
     directions = _directions(log, model, plant, names)
-    inputs = delayed_inputs(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
+    inputs = delayed_inputs(log.sides, DT_S, input_delay_s(log, model, model.effects))
     states, changes = _run(log, plant, directions, inputs, start)
     channels, samples = tuple(o.channel for o in log.observed), log.samples()
     t_s: Array = DT_S * samples.astype(float)
@@ -83,7 +84,15 @@ def plant_of(log: PreparedLog, model: Model) -> Plant:
         vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] = 0.0
         for name in ("torque_limit_nm", "stall_torque_nm"):
             vehicle[at[name]] *= 1000.0
+    vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += model.effects.get(DEAD_TIME, 0.0)
     return Plant(vehicle, route_of(log, model), {k: v for k, v in model.effects.items() if v != 0.0})
+
+
+def input_delay_s(log: PreparedLog, model: Model, effects: Mapping[str, float]) -> float:
+    """By how much the inputs of a log act late: dead time of the vehicle and of effects."""
+    if log.follows:
+        return effects.get(DEAD_TIME, 0.0)
+    return as_driven(model.vehicle, effects).drive.dead_time_s
 
 
 def _directions(log: PreparedLog, model: Model, plant: Plant, names: Sequence[str]) -> Directions:

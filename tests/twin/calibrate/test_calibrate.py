@@ -15,6 +15,7 @@ from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.files import write_files
 from terrafusion.twin.calibrate.log import prepare
 from terrafusion.twin.calibrate.model import Model, resolve
+from terrafusion.twin.calibrate.predict import predict
 from terrafusion.twin.calibrate.problem import Point, Problem
 from terrafusion.twin.calibrate.suggest import suggest
 from terrafusion.twin.model.soil import load_soil
@@ -239,3 +240,13 @@ def test_logs_that_lack_what_is_needed() -> None:
     lost = dataclasses.replace(drive(), terrain=None, terrain_name="moon")
     with pytest.raises(DataError, match="no soil of the library"):
         calibrate(lost, "elevate", None, NAMES[2:])
+
+
+def test_a_dead_time_among_the_effects_delays_the_inputs_as_that_of_the_vehicle_does() -> None:
+    recording, late_s = drive(), 0.15
+    log = prepare(recording, nominal())
+    plain = nominal().replaced({"vehicle.drive.dead_time_s": nominal().vehicle.drive.dead_time_s + late_s})
+    on_top = nominal().replaced({"effects.dead_time/transport": late_s})
+    both = (predict(log, model, NAMES, log.start) for model in (plain, on_top))
+    for one, other in zip(*both, strict=True):
+        np.testing.assert_allclose(one.value, other.value, atol=1e-9)

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.predict import LEAD_S, POSE, plant_of, route_of, run_up
+from terrafusion.twin.calibrate.predict import LEAD_S, POSE, input_delay_s, plant_of, route_of, run_up
 from terrafusion.twin.engine import codegen
 from terrafusion.twin.engine.codegen import LANES, LANES_32, Variant
 from terrafusion.twin.engine.integrate import compiled
@@ -30,7 +30,7 @@ from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, WHEELS
 from terrafusion.twin.scenario.commands import delayed_inputs
-from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
+from terrafusion.twin.sensors.effects import DEAD_TIME
 
 Effects = Mapping[str, float]
 MotionEffects = tuple[tuple[str, float], ...]  # effects of a set that change the motion, with their values
@@ -132,17 +132,12 @@ def make_lanes(
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
         named = {*group, *SOIL_KEYS, *effects} & {*candidates.moving}
         present = {k: effects.get(k, 0.0) or ABSENT_SHARE * float(scales[k]) for k in sorted(named)}
-        delay_s = _input_delay_s(log, model, effects)
+        delay_s = input_delay_s(log, model, effects)
         if (id(log), delay_s) not in inputs:
             inputs[id(log), delay_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, delay_s))
         plant = Plant(vehicle, base.route, {**base.effects, **present})
         out.append(Lane(log, plant, inputs[id(log), delay_s], start))
     return out
-
-
-def _input_delay_s(log: PreparedLog, model: Model, effects: Effects) -> float:
-    delay_s = effects.get(DEAD_TIME, 0.0)
-    return delay_s if log.follows else as_driven(model.vehicle, {DEAD_TIME: delay_s}).drive.dead_time_s
 
 
 def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
