@@ -151,7 +151,7 @@ def top_speed_mps(scenario: Scenario) -> float:
     """The fastest forward speed the scenario commands, by its segments' mean and amplitude."""
     if scenario.waypoints:
         return scenario.waypoint_speed_mps
-    return max(abs(s.v_mps) + abs(s.v_amplitude_mps) for s in scenario.drive)
+    return max(s.v_mps + abs(s.v_amplitude_mps) for s in scenario.drive)
 
 
 def at_speed(scenario: Scenario, scale: float) -> Scenario:

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.library import known_names
 from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment
 from terrafusion.twin.sweep.load import load_sweep
 from terrafusion.twin.sweep.plan import Axis, Sweep, at_speed, top_speed_mps
 
@@ -164,6 +165,8 @@ def test_scaled_speeds_scale_the_whole_twist() -> None:
         at_speed(scenario, 0.5).commanded(t_s), 0.5 * scenario.commanded(t_s), atol=1e-15
     )
     assert top_speed_mps(scenario) == pytest.approx(scenario.commanded(t_s)[:, 0].max(), abs=1e-3)
+    backwards = (DriveSegment(5.0, 0.5, v_amplitude_mps=0.2, period_s=2.0), DriveSegment(5.0, -1.5))
+    assert top_speed_mps(dataclasses.replace(scenario, drive=backwards)) == pytest.approx(0.7)
     waypoints = load_scenario("waypoints")
     assert top_speed_mps(at_speed(waypoints, 0.5)) == 0.5 * waypoints.waypoint_speed_mps
 
