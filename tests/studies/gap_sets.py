@@ -43,11 +43,11 @@ from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
-from terrafusion.twin.gap.rollout.delay import DELAYS
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.sensors.effects import DELAYS
 from terrafusion.twin.simulate import simulate
 
 FIRST_SEED, ODD, HELD_OUT = 51_234, 60, 100

@@ -1,7 +1,8 @@
 """Optional effects in a simulated drive: on the plant, on its motion and on each channel.
 
 Effects on the motion are part of the plant. What effects add to the readings (`measurement.correction`) is
-added to the channels, whose noise stays the same. A delay of a whole sensor shifts its stamps.
+added to the channels, whose noise stays the same. A delay of a whole sensor shifts its stamps, a late GNSS
+velocity is an earlier one.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import moves
+from terrafusion.twin.effects.sensing import CLOCK_S
 from terrafusion.twin.effects.steered import drive_terms
 from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured
@@ -29,8 +31,20 @@ from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
 C = TypeVar("C", Imu, Gnss)
 
 DEAD_TIME = "dead_time/transport"
-STAMPED_LATE = {"imu": "imu_time_offset/shift", "gnss": "gnss_latency/both"}
-"""Delays of a whole channel."""
+IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
+VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
+FIXES = ("gnss_east_m", "gnss_north_m", *VELOCITY)
+CLOCK_DRIFT = "imu_time_offset/drift"  # the delay that grows with time: its value is that after `CLOCK_S`
+DELAYS = {
+    "imu_time_offset/shift": IMU, CLOCK_DRIFT: IMU, "gnss_latency/both": FIXES,
+    "gnss_latency/velocity": VELOCITY,
+}  # fmt: skip
+"""Delays of the catalogue and the channels that they delay: exactly, where the forms are of first order."""
+
+
+def without_delays(effects: Mapping[str, float]) -> dict[str, float]:
+    """The effects that are no delays."""
+    return {key: value for key, value in effects.items() if key not in DELAYS}
 
 
 def with_effects(
@@ -85,27 +99,33 @@ def with_sensor_effects(
     wheels, imu, gnss, motor = recording.wheels, recording.imu, recording.gnss, recording.motor
     if wheels is None or imu is None or gnss is None or motor is None:
         raise ValueError("a simulated recording has all channels")
-    late = {name: effects.get(key, 0.0) for name, key in STAMPED_LATE.items()}
-    rest = {key: value for key, value in effects.items() if key not in STAMPED_LATE.values()}
-    rest |= drive_terms(vehicle.drive.type)
+    rest = without_delays(effects) | drive_terms(vehicle.drive.type)
+    imu_t_s: Array = 1e-9 * (imu.t_ns - recording.start_ns).astype(float)
+    imu_late_s = effects.get("imu_time_offset/shift", 0.0) + effects.get(CLOCK_DRIFT, 0.0) * imu_t_s / CLOCK_S
     ground = under_wheels(plant.route, plant.vehicle, motion.t_s, driven.states)
     mounting = mounting_vector(vehicle)
     added = corrections(driven.states, driven.inputs, plant.vehicle, ground, mounting, rest)
     columns = dict(zip(OUTPUTS, added.T, strict=True))
+    if late_s := effects.get("gnss_latency/velocity", 0.0):
+        y = measured(driven.states, driven.inputs, plant.vehicle, ground, mounting, rest)
+        for name in VELOCITY:
+            now = y[:, OUTPUTS.index(name)]
+            columns[name] = columns[name] + np.interp(motion.t_s - late_s, motion.t_s, now) - now
     rows = rows_at_rate(len(motion.t_s), sample_rate_hz(motion.t_s), vehicle.sensors.wheels.rate_hz)
     epochs_s = (gnss.t_ns - recording.start_ns) * 1e-9 - gnss_latency_s
     seen = {name: np.interp(epochs_s, motion.t_s, column) for name, column in columns.items()}
     return dataclasses.replace(
         recording,
         wheels=_wheels(wheels, columns, motion.t_s, rows),
-        imu=_stamped(_imu(imu, columns), late["imu"]),
-        gnss=_stamped(_gnss(gnss, seen), late["gnss"]),
+        imu=_stamped(_imu(imu, columns), imu_late_s),
+        gnss=_stamped(_gnss(gnss, seen), effects.get("gnss_latency/both", 0.0)),
         motor=dataclasses.replace(motor, current_a=motor.current_a + _sides(columns, "current", "a")[rows]),
     )
 
 
-def _stamped(channel: C, late_s: float) -> C:
-    return dataclasses.replace(channel, t_ns=channel.t_ns + round(late_s * 1e9))
+def _stamped(channel: C, late_s: float | Array) -> C:
+    late_ns = np.round(1e9 * np.asarray(late_s)).astype(np.int64)
+    return dataclasses.replace(channel, t_ns=channel.t_ns + late_ns)
 
 
 def _sides(columns: Mapping[str, Array], name: str, unit: str) -> Array:

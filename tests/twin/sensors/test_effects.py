@@ -85,6 +85,15 @@ def test_a_late_gnss_velocity_is_the_velocity_of_before() -> None:
     late = simulate(SHORT, noiseless=True, effects={"gnss_latency/velocity": 0.2}).gnss.velocity_enu_mps
     change = np.abs(late[1:, :2] - now[1:, :2]).mean()
     assert np.abs(late[1:, :2] - now[:-1, :2]).mean() < 0.2 * change
+    long = simulate(SHORT, noiseless=True, effects={"gnss_latency/velocity": 1.0}).gnss.velocity_enu_mps
+    np.testing.assert_allclose(long[5:, :2], now[:-5, :2], atol=1e-6)  # of any length
+
+
+def test_the_stamps_of_a_clock_that_runs_slow_are_later_and_later(noisy) -> None:
+    late = simulate(SHORT, seed=3, effects={"imu_time_offset/drift": 0.3})
+    elapsed_ns = noisy.imu.t_ns - noisy.start_ns
+    np.testing.assert_allclose(late.imu.t_ns - noisy.imu.t_ns, 0.3 / 60.0 * elapsed_ns, atol=1.0)
+    assert np.array_equal(late.imu.gyro_radps, noisy.imu.gyro_radps)
 
 
 def test_the_antenna_reads_from_where_it_really_is() -> None:

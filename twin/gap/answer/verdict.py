@@ -14,7 +14,7 @@ from terrafusion.twin.gap.infer.calibration import Head, calibration_head, log_o
 from terrafusion.twin.gap.infer.detection import Detection
 from terrafusion.twin.gap.infer.explain import Explanation, Sets
 from terrafusion.twin.gap.infer.single_effects import Fitted
-from terrafusion.twin.gap.rollout.delay import DELAYS
+from terrafusion.twin.sensors.effects import DELAYS
 
 UNKNOWN = 0.5  # probability of an unknown cause, given a gap, above which that is the verdict
 CREDIBLE, LEAST_MEMBER = 0.95, 0.02

@@ -19,7 +19,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence
-from terrafusion.twin.gap.rollout.delay import DELAYS
+from terrafusion.twin.sensors.effects import DELAYS
 
 INSENSITIVE = 10.0
 """A law is insensitive where its sensitivity, at the end of its range, makes a smaller square in all runs;

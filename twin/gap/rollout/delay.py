@@ -16,21 +16,7 @@ from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import LEAD_S, averaging
 from terrafusion.twin.effects.sensing import CLOCK_S
 from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map
-
-IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
-FIXES = ("gnss_east_m", "gnss_north_m", *VELOCITY)
-CLOCK_DRIFT = "imu_time_offset/drift"  # the delay that grows with time: its value is that after `CLOCK_S`
-DELAYS = {
-    "imu_time_offset/shift": IMU, CLOCK_DRIFT: IMU, "gnss_latency/both": FIXES,
-    "gnss_latency/velocity": VELOCITY,
-}  # fmt: skip
-"""Delays of the catalogue and the channels that they delay."""
-
-
-def without_delays(effects: Mapping[str, float]) -> dict[str, float]:
-    """The effects that are no delays."""
-    return {key: value for key, value in effects.items() if key not in DELAYS}
+from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, IMU
 
 
 def delayed_samples(log: PreparedLog, effects: Mapping[str, float]) -> list[tuple[Indices, Array]]:

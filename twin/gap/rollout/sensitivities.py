@@ -33,9 +33,10 @@ from terrafusion.twin.gap.rollout.batch import (
     motion_effects,
     simulate_lanes,
 )
-from terrafusion.twin.gap.rollout.delay import delayed_samples, without_delays
+from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.ground_patches import patch_columns
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
+from terrafusion.twin.sensors.effects import without_delays
 
 STEP = 0.3
 """Step of the differences, in typical sizes: finite, because the tangent at a wheel about to slide or to

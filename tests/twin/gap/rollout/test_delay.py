@@ -10,9 +10,10 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
-from terrafusion.twin.gap.rollout.delay import CLOCK_DRIFT, DELAYS, IMU, delayed_samples, without_delays
+from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, predictions
 from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, IMU, without_delays
 from tests.twin.gap.runs import run
 
 CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
