@@ -60,7 +60,7 @@ def diagnose(
         terrain: ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
         effects: candidates by name; None: the whole catalogue.
         significance: threshold of the test for a gap.
-        seed: of the permutations and replicates.
+        seed: of the replicates.
         progress: called with the share done, 0 to 1.
 
     Raises:

@@ -72,7 +72,7 @@ def gap(
     ] = "auto",
     write_vehicle: Path | None = None,
     judge: bool = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of replicates.")] = 0,
     explain: ExplainOption = None,
     *,
     how: HowRead,

@@ -65,7 +65,7 @@ def diagnose(
         effects: candidates by name; None: the whole catalogue, registered ones included.
         significance: threshold of the test for a gap.
         source: one of `calibrate.inputs.SOURCES`: what drives the twin.
-        seed: of permutations and replicates.
+        seed: of replicates.
         jobs: threads.
         progress: called with the share done, 0 to 1.
         cache: an empty dict, passed to several diagnoses with the same vehicle and soils to linearise the
@@ -127,7 +127,7 @@ def diagnose_evidence(
     if limited or evidence.patchier is not None:
         verdict = verdict.where_references_fall_short(detection.p_value <= STRICTER * significance)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit)
-    where = gap_map(evidence, sigma, offsets, seed)  # the misfit of laws would hide the place
+    where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
     return GapDiagnosis(
         vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,

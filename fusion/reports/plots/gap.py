@@ -9,8 +9,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Sheet, name_ticks
+from terrafusion.twin.gap.answer.cells import BANDS, REGIMES, regimes
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.answer.where import BANDS, REGIMES, regimes
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, CHANNEL_UNITS, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 

@@ -1,4 +1,4 @@
-"""Parts of the diagnosis alone: sensitivities, permutations of runs, probabilities, candidates."""
+"""Parts of the diagnosis alone: sensitivities, probabilities, candidates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.gap.answer.verdict import null_probability
-from terrafusion.twin.gap.answer.where import permutations
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, SMALLEST, Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
@@ -210,14 +209,6 @@ def test_graphs_hold_what_their_runs_need_and_every_run_once() -> None:
     assert list(of({}, *apart)) == [CANDIDATES.moving]  # one vector of the whole graph
     assert list(of({}, {"soil_strength/shear": 0.1})) == [()]
     assert list(of({"mass/at_cg": 0.1, "slope/uniform": 0.1})) == [CANDIDATES.moving]
-
-
-def test_choices_are_all_others_where_there_are_few() -> None:
-    assert len(permutations(5, 2, 0)) == 9
-    assert (0, 1) not in permutations(5, 2, 0)
-    some = permutations(23, 3, 0)
-    assert len(set(some)) == len(some) == 99
-    assert some == permutations(23, 3, 0)
 
 
 def test_null_probability_rises_with_the_p_value() -> None:

@@ -12,7 +12,7 @@ drives; both factors are unknown (Student 1908), and a tail probability is the m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,15 +63,26 @@ def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates,
 
 def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.random.Generator) -> Array:
     """Pooled scores (R, P) less their mean."""
-    P, size = len(A), (REPLICATES, len(A))
-    robot = rng.standard_normal(size) @ np.linalg.cholesky(offsets.known() + 1e-12 * np.eye(P)).T
-    change = np.sqrt(CHANGE_FREEDOM / rng.chisquare(CHANGE_FREEDOM, (REPLICATES, 1)) * offsets.changed)
-    robot += change * rng.standard_normal(size)
+    robot = drawn_robots(offsets, REPLICATES, rng)
     values, vectors = np.linalg.eigh(A)
-    noise = rng.standard_normal(size) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    noise = rng.standard_normal((REPLICATES, len(A))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    scatter = drawn_scatter(offsets, len(runs), REPLICATES, rng)
+    return robot @ A + noise + sum(own @ r.A for own, r in zip(scatter, runs, strict=True))
+
+
+def drawn_robots(offsets: RobotOffsets, count: int, rng: np.random.Generator) -> Array:
+    """Offsets (count, P) of a robot on the judged drives, less their mean."""
+    P, size = len(offsets.mean), (count, len(offsets.mean))
+    robot = rng.standard_normal(size) @ np.linalg.cholesky(offsets.known() + 1e-12 * np.eye(P)).T
+    change = np.sqrt(CHANGE_FREEDOM / rng.chisquare(CHANGE_FREEDOM, (count, 1)) * offsets.changed)
+    return np.asarray(robot + change * rng.standard_normal(size))
+
+
+def drawn_scatter(offsets: RobotOffsets, runs: int, count: int, rng: np.random.Generator) -> Iterator[Array]:
+    """How the offsets (count, P) of each run differ from the robot's."""
     freedom = float(offsets.references)
-    wider = np.sqrt(freedom / rng.chisquare(freedom, (REPLICATES, 1)) * offsets.scatter)
-    return robot @ A + noise + sum((wider * rng.standard_normal(size)) @ r.A for r in runs)
+    wider = np.sqrt(freedom / rng.chisquare(freedom, (count, 1)) * offsets.scatter)
+    return (wider * rng.standard_normal((count, len(offsets.mean))) for _ in range(runs))
 
 
 @dataclass(frozen=True, eq=False)
