@@ -19,7 +19,7 @@ from terrafusion.fusion.cli.common import (
 from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
-    "Folder for blind.json, report.html and the sealed labels.",
+    "Folder for blind.json, report.html and the labels.",
     (
         "config.json",
         "labels.*",
@@ -29,7 +29,7 @@ OUTPUT = Output(
         "blind.json",
         "report.html",
     ),
-    ("labels.sealed",),
+    ("labels.salt",),
     goes_on=True,
 )
 

@@ -107,25 +107,20 @@ def answer_all(
     progress: Callable[[float], None] | None = None,
     minutes: float = math.inf,
 ) -> None:
-    """Answers of all `methods` to the trials that have none yet; closes the answers when all are stored, or
-    after so many minutes."""
+    """Answers of all `methods` to the trials that have none yet, until all are stored, or for so many
+    minutes."""
     until_s = time.monotonic() + 60.0 * minutes
     done = answered(folder)
     _rewrite(folder, done)  # without a line that was cut off
     missing = [trial for trial in trials if trial.trial not in done]
-    seal.forbid(folder)
-    try:
-        questions = ((case, methods, folder) for case in cases(missing))
-        for entry in _stored(folder / seal.ANSWERS, questions, pool):
-            done[entry["trial"]] = entry
-            if progress is not None:
-                progress(len(done) / len(trials))
-            if time.monotonic() > until_s:
-                break
-    finally:
-        seal.permit(folder)
+    questions = ((case, methods) for case in cases(missing))
+    for entry in _stored(folder / seal.ANSWERS, questions, pool):
+        done[entry["trial"]] = entry
+        if progress is not None:
+            progress(len(done) / len(trials))
+        if time.monotonic() > until_s:
+            break
     _rewrite(folder, done)
-    seal.close(folder)
 
 
 def _stored(path: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> Iterator[dict[str, Any]]:
@@ -156,14 +151,9 @@ def _append(path: Path, entry: Mapping[str, Any]) -> None:
         raise unwritable(path, error) from None
 
 
-def answer(case: BlindCase, methods: Mapping[str, Diagnose], sealed: Path | None) -> dict[str, Any]:
+def answer(case: BlindCase, methods: Mapping[str, Diagnose]) -> dict[str, Any]:
     """Answers of all methods: {"trial", method: {"seconds", "error", "answer"}}. An exception is recorded: it
-    counts as wrong.
-
-    The process cannot open the labels in the folder `sealed`.
-    """
-    if sealed is not None:
-        seal.forbid(sealed)
+    counts as wrong."""
     return {"trial": case.trial, **{name: _answer(case, method) for name, method in methods.items()}}
 
 
@@ -189,7 +179,7 @@ def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, pool: Po
     asked = [t for t in trials if t.trial in with_share and t.family in ("same", "shifted")]
     effects = {t.trial: t.effects() for t in asked}
     questions = (
-        (case, {DIAGNOSIS: functools.partial(oracle, effects=effects[case.trial])}, None)
+        (case, {DIAGNOSIS: functools.partial(oracle, effects=effects[case.trial])})
         for case in cases([t for t in asked if t.trial not in done])
     )
     done |= {entry["trial"]: entry for entry in _stored(folder / ORACLE, questions, pool)}

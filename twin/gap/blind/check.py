@@ -1,4 +1,4 @@
-"""`run_blind_check`: plan, seal, answer, open, score; continued where it was stopped.
+"""`run_blind_check`: plan, commit, answer, open, score; continued where it was stopped.
 
 from terrafusion.twin.gap.blind.check import run_blind_check
 scores = run_blind_check("out", diagnose, scale=QUICK)
@@ -24,7 +24,7 @@ from terrafusion.twin.gap.blind.answers import (
     ask_oracle,
 )
 from terrafusion.twin.gap.blind.pin import plant_sha256, trials_sha256
-from terrafusion.twin.gap.blind.plan import FULL, CheckSize, from_text, plan, to_text
+from terrafusion.twin.gap.blind.plan import FULL, CheckSize, plan, to_text
 from terrafusion.twin.gap.blind.score import score
 
 RESULT = "blind.json"
@@ -55,7 +55,7 @@ def run_blind_check(
 
     Raises:
         ConfigError: the folder holds a check of another seed, scale, plant or set of methods.
-        DataError: answers or labels were changed, see `seal.unseal`.
+        DataError: answers or labels were changed, see `seal.open_labels`.
         TerrafusionError: the folder cannot be written, or the workers died.
     """
     folder, pool = Path(out), pool or Pool()
@@ -68,11 +68,13 @@ def run_blind_check(
         "trials_sha256": trials_sha256(),
         "methods": list(methods),
     }
-    _seal_labels(folder, to_text(trials), public)
-    if not (folder / seal.CLOSED).is_file():
+    labels = to_text(trials)
+    _commit(folder, labels, public)
+    if not seal.opened(folder):
         answer_all(folder, trials, methods, pool, progress, minutes)
+    seal.open_labels(folder, labels)
     answers = answered(folder)
-    opened = [trial for trial in from_text(seal.unseal(folder)) if trial.trial in answers]
+    opened = [trial for trial in trials if trial.trial in answers]
     best = {} if oracle is None else ask_oracle(folder, opened, oracle, pool)
     scores = {**score(opened, answers, best, list(methods)), **public, "planned": len(trials)}
     text = json.dumps(scores, indent=1, allow_nan=False)
@@ -80,12 +82,12 @@ def run_blind_check(
     return scores
 
 
-def _seal_labels(folder: Path, labels: bytes, public: Mapping[str, Any]) -> None:
-    """Seals the labels, unless they are; then they must be of the same check."""
+def _commit(folder: Path, labels: str, public: Mapping[str, Any]) -> None:
+    """Commits to the labels, unless that is done; then it must have been for the same check."""
     before = seal.commitment(folder)
     if before is None:
         folder.mkdir(parents=True, exist_ok=True)
-        seal.seal(folder, labels, public)
+        seal.commit(folder, labels, public)
     elif {name: before.get(name) for name in public} != dict(public):
         raise ConfigError(
             "holds a blind check of another seed or size, or of another version of the plant",

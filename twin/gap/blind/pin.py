@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections.abc import Iterable
 from importlib import resources
-from pathlib import Path
 
 from terrafusion.twin.gap.blind.plan import SOILS, VEHICLE
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, stacked_numbers
@@ -27,26 +26,23 @@ def plant_sha256() -> str:
 
     Numbers of vehicles and soils count as far as the plant takes them, to twelve digits.
     """
-    digest = hashlib.sha256()
-    with resources.as_file(resources.files("terrafusion.twin.gap.blind")) as folder:
-        _add(digest, folder, PLANT)
-    digest.update(json.dumps(_numbers(), sort_keys=True).encode())
-    return digest.hexdigest()
+    return _sha256(PLANT, json.dumps(_numbers(), sort_keys=True))
 
 
 @functools.cache
 def trials_sha256() -> str:
     """Hash (hex) of drives and severities: a check is not continued with others."""
+    return _sha256(TRIALS)
+
+
+def _sha256(patterns: Iterable[str], more: str = "") -> str:
     digest = hashlib.sha256()
     with resources.as_file(resources.files("terrafusion.twin.gap.blind")) as folder:
-        _add(digest, folder, TRIALS)
+        for file in (file for pattern in patterns for file in sorted(folder.glob(pattern))):
+            digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
+            digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")
+    digest.update(more.encode())
     return digest.hexdigest()
-
-
-def _add(digest: hashlib._Hash, folder: Path, patterns: Iterable[str]) -> None:
-    for file in (file for pattern in patterns for file in sorted(folder.glob(pattern))):
-        digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
-        digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")
 
 
 def _numbers() -> dict[str, dict[str, list[str]]]:

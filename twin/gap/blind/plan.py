@@ -4,9 +4,9 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -90,11 +90,6 @@ class Trial:
     def effects(self) -> tuple[str, ...]:
         """True effects of the catalogue, and names from outside it."""
         return tuple(shapes()[key].effect for key in self.shapes)
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Self:
-        lists = {key: tuple(entry[key]) for key in ("shapes", "values")}
-        return cls(**{**entry, **lists})
 
 
 def plan(seed: int, scale: CheckSize) -> list[Trial]:
@@ -212,10 +207,6 @@ def another_robot(vehicle: VehicleParams, rng: np.random.Generator) -> VehiclePa
     )
 
 
-def to_text(trials: Sequence[Trial]) -> bytes:
-    """The labels as they are sealed."""
-    return json.dumps([dataclasses.asdict(trial) for trial in trials], indent=0, sort_keys=True).encode()
-
-
-def from_text(text: bytes) -> list[Trial]:
-    return [Trial.from_json(entry) for entry in json.loads(text)]
+def to_text(trials: Sequence[Trial]) -> str:
+    """The labels as they are committed to."""
+    return json.dumps([dataclasses.asdict(trial) for trial in trials], indent=0, sort_keys=True)
