@@ -22,9 +22,9 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, split_windows
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
-from terrafusion.twin.effects.terrain import FORMS as GROUND_FORMS
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
+from terrafusion.twin.gap.infer.law_misfit import GROUND
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import beyond_robot, beyond_scatter
 from terrafusion.twin.gap.null.evidence import GapEvidence
@@ -42,7 +42,6 @@ MOST_REPEATS = 10  # if the best drive would have to be repeated more often, non
 LIFTED = "wheels lifted"
 PAYLOAD = ", with payload"
 PAYLOAD_SHARE = 0.25  # of the robot's mass, at its centre of gravity
-GROUND = frozenset(form.effect for form in GROUND_FORMS)
 STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothing
 
 

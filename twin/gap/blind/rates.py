@@ -1,12 +1,10 @@
 """Shares with their intervals, and how well stated confidence agrees with what came true."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-Z95 = 1.959963984540054
 BINS = 10
 
 
@@ -26,10 +24,10 @@ class Rate:
         """Bounds of the true share; 0 to 1 where nothing was counted."""
         if not self.count:
             return 0.0, 1.0
-        n, p, z2 = self.count, self.hits / self.count, Z95 * Z95
-        centre = (p + z2 / (2 * n)) / (1 + z2 / n)
-        half = Z95 / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-        return max(0.0, centre - half), min(1.0, centre + half)
+        from scipy.stats import binomtest
+
+        found = binomtest(self.hits, self.count).proportion_ci(method="wilson")
+        return float(found.low), float(found.high)
 
     def to_json(self) -> dict[str, float | int | None]:
         low, high = self.interval()

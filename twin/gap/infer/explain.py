@@ -22,6 +22,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.chance import ReferenceGains
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
+from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
@@ -40,7 +41,6 @@ LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a cha
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
 much as a law is wrong."""
-UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
 
 
 @dataclass(frozen=True, eq=False)
