@@ -1,4 +1,4 @@
-"""Effects of the sensors. Positive offsets in time mean a reading that shows the past."""
+"""Effects of the sensors. With a positive offset in time, a reading is that of an earlier time."""
 
 import math
 from typing import Any

@@ -125,7 +125,7 @@ def diagnose_evidence(
     limited = drives is not None and drives.limits()
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
     if limited or evidence.patchier is not None:
-        verdict = verdict.where_references_fall_short(detection.p_value <= STRICTER * significance)
+        verdict = verdict.withheld_on_unseen_drives(detection.p_value <= STRICTER * significance)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit)
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)

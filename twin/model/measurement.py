@@ -89,7 +89,7 @@ def measured(
         states, inputs: (N, X) and (N, U).
         vehicle: (V,) `VEHICLE_PARAMETERS`.
         soil: (4 S,) or (N, 4 S) `SOIL_PARAMETERS` wheel by wheel.
-        mounting: `MOUNTING` (see `layout.mounting_vector`).
+        mounting: `MOUNTING` (see `vectors.mounting_vector`).
         effects: values of optional parameters by name; each that is named is in the graph.
     """
     names = tuple(sorted(effects or {}))

@@ -56,7 +56,7 @@ def plane_rotation(slope_rad: float, aspect_rad: float) -> Array:
 def motion_of(
     t_s: Array, states: Array, vehicle: VehicleParams, slope_rad: float, aspect_rad: float
 ) -> BodyMotion:
-    """Motion of the body origin from the states (N, 38), whose velocities are the centre of gravity's."""
+    """Motion of the body origin from the states (N, X), whose velocities are the centre of gravity's."""
     world_plane = plane_rotation(slope_rad, aspect_rad)
     x, y, yaw, u, v, r = (states[:, INDEX[name]] for name in ("x", "y", "yaw", "u", "v", "r"))
     zero, one = np.zeros_like(x), np.ones_like(x)

@@ -26,7 +26,7 @@ from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
 from terrafusion.twin.gap.infer.law_misfit import GROUND
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import beyond_robot, beyond_scatter
+from terrafusion.twin.gap.infer.predictive import marginalise_robot_offsets, marginalise_run_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
@@ -79,7 +79,9 @@ class Planner:
     @classmethod
     def of(cls, evidence: GapEvidence, sigma: Array, robot: RobotOffsets, scores: Sequence[Score]) -> Self:
         """After judged runs with these scores."""
-        return cls(evidence, sigma, robot, np.sum([beyond_scatter(s.A, robot) for s in scores], axis=0))
+        return cls(
+            evidence, sigma, robot, np.sum([marginalise_run_offsets(s.A, robot) for s in scores], axis=0)
+        )
 
     def next_run(self, verdict: GapVerdict) -> NextRun | None:
         """For the first named cause with look-alikes and the most probable of these; None without one."""
@@ -105,15 +107,15 @@ class Planner:
         repeats = next(enough, None)
         if repeats is None:
             why = (
-                f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by "
+                f"none of the drives tried separates {pair[0]} from {pair[1]} (the best, '{best}', by "
                 f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
             )
             return NextRun(BY_HAND, pair, sigmas(best), why)
         mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
         load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
         why = (
-            f"of {len(drives())} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
-            f"{sigmas(best):.1f} sigma with these runs at the size found; {times(repeats)} should do{load}"
+            f"of {len(drives())} drives simulated, this one separates {pair[0]} from {pair[1]} best: by "
+            f"{sigmas(best):.1f} sigma, together with these runs; drive it {times(repeats)}{load}"
         )
         return NextRun(best, pair, sigmas(best), why)
 
@@ -123,7 +125,7 @@ class Planner:
         Args:
             more: (P, P) information of further runs, from `forecast`.
         """
-        every = beyond_robot(self.known + more, self.robot)
+        every = marginalise_robot_offsets(self.known + more, self.robot)
         return min(
             self._remaining_sigmas(every, one, other.effect), self._remaining_sigmas(every, other, one.effect)
         )
@@ -143,7 +145,7 @@ class Planner:
             own = score(_forecast(self.evidence, name, effects), self.sigma)
         except TerrafusionError:
             return np.zeros((P, P))
-        information = beyond_scatter(own.A, self.robot)
+        information = marginalise_run_offsets(own.A, self.robot)
         if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
             keys = self.evidence.candidates.keys
             ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]

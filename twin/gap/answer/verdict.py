@@ -81,10 +81,10 @@ class GapVerdict:
         """The most probable of the named causes that cannot be distinguished from others."""
         return next((c for c in self.causes if c.effect in self.named and len(c.members) > 1), None)
 
-    def where_references_fall_short(self, sure: bool = True) -> Self:
+    def withheld_on_unseen_drives(self, significant: bool = True) -> Self:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
-        well, as it may come from these, or where the test is not `sure`."""
-        if sure and self.kind != "unknown" and self.log_odds >= 0.0:
+        well, as it may come from these, or where the test is not `significant` at a stricter threshold."""
+        if significant and self.kind != "unknown" and self.log_odds >= 0.0:
             return self
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
         return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)

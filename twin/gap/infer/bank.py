@@ -1,9 +1,10 @@
-"""Bank of nonlinear signatures: what each law does to the errors of the judged runs, at several sizes.
+"""Bank of nonlinear signatures: by how much each law changes the errors of the judged runs, at several sizes.
 
-A signature between two sizes is interpolated. Laws that act on the sensors alone and no delays are linear
-(their columns are their signatures). All others begin with their sensitivity, up to the ends of their range,
-and are simulated, along their one parameter, where a size is of interest. A law of several parameters that
-vanishes to first order is simulated along the direction in which all are equal, in typical sizes.
+A signature between two sizes is interpolated. Laws of the sensors alone that are no delays and have sizes of
+either sign are linear (their columns are their signatures). All others begin with their sensitivity, up to
+the ends of their range, and are simulated, along their one parameter, where a size is of interest. A law of
+several parameters that vanishes to first order is simulated along the direction in which all are equal, in
+typical sizes.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The judged runs deviate in many ways: in the score of each column, along each form jointly with all others,
 and along the nuisance basis. Each deviation is turned into its own tail probability without a gap, and the
-least of them is compared with the least of replicates of the judged drives (Westfall and Young 1993, minP):
-a deviation that is uncertain on drives unlike the references' is no bar for one that is not.
+least of them is compared with the least of replicates of the judged drives (Westfall and Young 1993, minP).
+So a deviation that varies much on drives unlike the references' does not hide one that varies little.
 
 Scores are normal given how much wider than expected offsets scatter from run to run and change on other
 drives; both factors are unknown (Student 1908), and a tail probability is the mean over them.
@@ -45,7 +45,7 @@ class Detection:
 def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int) -> Detection:
     """How unusual the judged runs are, taken together, among replicates of them."""
     A = np.sum([r.A for r in runs], axis=0)
-    own = len(A) - offsets.misfit  # no law misfit is a finding
+    own = len(A) - offsets.misfit  # columns of law misfit are not tested
     parts = [
         (A @ offsets.known() @ A + A)[:own, :own],
         ((A * offsets.changed) @ A)[:own, :own],

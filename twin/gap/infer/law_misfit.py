@@ -1,7 +1,7 @@
-"""What the offsets that references show mean on drives that they did not make.
+"""Model error of the offsets learned from references when they are used on other drives.
 
-The robot's laws are others than the twin's. Offsets that make up for it on the references' drives are not
-quite right on another drive, in proportion to what they do there (after Kennedy and O'Hagan 2001, with a
+The robot's laws differ from the twin's. Offsets that compensate for that on the references' drives are not
+quite right on another drive, in proportion to their effect there (after Kennedy and O'Hagan 2001, with a
 basis in place of a Gaussian process): what they predict in a channel, and what the laws of the ground, of the
 vehicle and of the sensors predict in all of them, times functions of the commands, join the random effects as
 columns of their own. References know their coefficients as far as their drives excite them. These and the

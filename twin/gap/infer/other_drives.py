@@ -73,7 +73,7 @@ class RobotOffsets:
 def learn_offsets(
     references: Sequence[Score], candidates: int, scales: Sequence[float] = SCATTER_SCALES
 ) -> RobotOffsets:
-    """From at least `FEWEST` references; the first `candidates` columns are those of effects.
+    """From references; fewer than `FEWEST` show no scatter. The first `candidates` columns are of effects.
 
     Args:
         scales: factors of the prior scatter to choose from; replicates of the twin, which has none, show

@@ -83,19 +83,19 @@ def metric(runs: Sequence[Products], weight: Array, sigma: Array, robot: RobotOf
         rest = without_states(np.tensordot(weight, run.gram, axes=1), sigma)
         rest[:, -1] -= rest[:, :P] @ robot.mean
         rest[-1] -= robot.mean @ rest[:P]
-        total += beyond_scatter(rest, robot)
-    total = beyond_robot(total, robot)
+        total += marginalise_run_offsets(rest, robot)
+    total = marginalise_robot_offsets(total, robot)
     return Metric(np.pad(0.5 * (total + total.T), (0, 1)), P)
 
 
-def beyond_scatter(products: Array, robot: RobotOffsets) -> Array:
+def marginalise_run_offsets(products: Array, robot: RobotOffsets) -> Array:
     """A run's inner products (M, M), whose first columns are P, with omega projected out."""
     P = len(robot.mean)
     own = np.linalg.solve(np.diag(1.0 / robot.scatter) + products[:P, :P], products[:P])
     return products - products[:, :P] @ own
 
 
-def beyond_robot(products: Array, robot: RobotOffsets) -> Array:
+def marginalise_robot_offsets(products: Array, robot: RobotOffsets) -> Array:
     """Inner products (M, M) of all runs with phi projected out."""
     P, V = len(robot.mean), robot.covariance
     own = np.linalg.solve(np.eye(P) + V @ products[:P, :P], V @ products[:P])

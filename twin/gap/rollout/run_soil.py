@@ -33,8 +33,9 @@ LIMIT_SIGMAS = 3.0
 STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
 """Most steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
 SHORTER, LEAST_STEP = 0.4, 0.1
-"""Factor of a step that did not reduce the errors, and the least share of one: a full step goes too far where
-slip grows steeply, and a run that stays where it is would seem to be on the references' soil."""
+"""Factor by which a step that did not reduce the errors is shortened, and the least share of a full step that
+is tried. A full step overshoots where slip grows steeply; without shorter ones the run would keep the
+references' soil."""
 ALONE = (1.0, 0.3)
 """1 sigma of a step of one run's soil and of the effects beside it, in typical sizes (assumed)."""
 

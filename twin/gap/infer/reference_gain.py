@@ -1,9 +1,8 @@
-"""What laws explain on references, where nothing has changed.
+"""How much of the likelihood that laws gain they also gain on references, where nothing has changed.
 
-A nonlinear signature, or the discrepancy of a law, also fits what twin and robot always differ by, and how
-the ground scatters beyond what the random effects hold. Both are in references as in judged runs: what a set
-of laws gains on references, at the sizes of the judged runs but with free coefficients, is no sign of a
-change.
+A nonlinear signature, or the discrepancy of a law, also fits errors that the twin makes in every run, and
+scatter of the ground that the random effects do not model. Both are in the references too. So the gain of a
+set of laws on references, at the sizes of the judged runs but with free coefficients, is subtracted.
 """
 
 from __future__ import annotations
