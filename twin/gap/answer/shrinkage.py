@@ -19,8 +19,8 @@ from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 METRIC = "mean squared whitened error with soil, offsets and pose adapted, on runs left out of the fit"
-ABOVE_FLOOR = 3.0  # a share is given where the gap is so many standard deviations of the floor above it
-FREE = 10.0  # factor on theta's 1 sigma where it alone is recalibrated
+ABOVE_FLOOR = 3.0  # standard deviations of the floor (assumed) above which a gap has a share
+FREE = 10.0  # factor on theta's 1 sigma where it alone is recalibrated (assumed: nearly free)
 
 
 @dataclass(frozen=True, eq=False)

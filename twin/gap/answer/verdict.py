@@ -18,7 +18,7 @@ from terrafusion.twin.sensors.effects import DELAYS
 
 UNKNOWN = 0.5  # probability of an unknown cause, given a gap, above which that is the verdict
 CREDIBLE, LEAST_MEMBER = 0.95, 0.02
-"""Probability of a credible set, and the least of a member, given the effects beside it."""
+"""Probability of a credible set, and the least (assumed) of a member, given the effects beside it."""
 FINEST_P = {False: 1e-4, True: 1e-3}
 """Least p-value that counts as evidence of an unknown cause: below, it is extrapolated (assumed).
 Keys: whether drives are unlike the references'."""

@@ -24,7 +24,7 @@ from terrafusion.twin.gap.null.loud_noise import LOUD
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import physical_error
 
-LEAST_SAMPLES = 5
+LEAST_SAMPLES = 5  # effective, of all runs together, from which a cell is listed (assumed)
 REPLICATES = 299  # of the judged drives
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
 LEAST_SPREAD = 0.05  # variance added to that of the references' log mean squares, in runs (assumed)

@@ -25,8 +25,9 @@ from terrafusion.twin.gap.null.score import Score
 
 CHANGE_FREEDOM = 4
 """Degrees of freedom of how much offsets change on other drives, which no reference shows (assumed)."""
-JITTER = 0.02  # variance added to a standardised score: no combination of scores is taken as exact
-WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)  # 1 sigma of an effect's size, and of an unknown cause's
+JITTER = 0.02  # variance added to a standardised score (assumed): no combination of them is taken as exact
+WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)
+"""1 sigma of an effect's size, in typical ones, and those of an unknown cause's (assumed)."""
 REPLICATES, LOWEST = 1000, 20
 """Replicates, and how many of the lowest show the tail, where p-values are proportional to the statistic."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost

@@ -28,8 +28,8 @@ PRIOR_COLUMNS = 8.0
 effects together and for the columns of each channel: where the twin is wrong on the references' drives, it
 may be as wrong on others."""
 EM_STEPS, MISFIT_STEPS = 8, 3
-MISFIT_SCATTER = 0.1  # prior 1 sigma from run to run of a coefficient of law misfit
-CERTAIN = 3.0  # times its variance by which the square of a column must exceed it to be more than noise
+MISFIT_SCATTER = 0.1  # prior 1 sigma from run to run of a coefficient of law misfit (assumed)
+CERTAIN = 3.0  # times its variance (assumed) that the square of a column must exceed to be no noise
 FEWEST = 3  # references from which a scatter can be learned
 
 

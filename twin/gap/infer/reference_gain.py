@@ -17,12 +17,11 @@ from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.other_drives import FEWEST, RobotOffsets
 from terrafusion.twin.gap.infer.predictive import metric
-from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
+from terrafusion.twin.gap.infer.single_effects import RIDGE, Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import score
 
-GROUPS = 4  # most groups of references
-RIDGE = 1e-3  # information on a coefficient beforehand
+GROUPS = 4  # most groups of references: each costs as many rollouts as the judged runs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from terrafusion.twin.gap.data.candidates import SMALLEST, Candidates, Hypothesi
 from terrafusion.twin.gap.infer.bank import Ladder, is_simulated
 from terrafusion.twin.gap.infer.predictive import Metric
 
-RIDGE = 1e-3  # information on a size before the runs: 1 sigma is 30 typical sizes
+RIDGE = 1e-3  # information on a size before the runs (assumed): 1 sigma is 30 typical sizes
 SWEEPS, ENOUGH = 25, 1e-3  # most rounds of a joint fit, and the gain that ends it
 
 

@@ -21,7 +21,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
-ANY_SIZE = 30.0  # 1 sigma of effects, in typical sizes, in a run without references (assumed)
+ANY_SIZE = 30.0  # 1 sigma of effects of any size, and of functions of the commands, in their units (assumed)
 LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet (assumed)
 
 

@@ -21,11 +21,11 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2 = 0.3, 0.3, 0.6
 """Width of a cell; the middle one is centred on zero."""
-LEAST_S = 1.0  # time of all references in a cell from which it counts as covered
+LEAST_S = 1.0  # time of all references in a cell from which it counts as covered (assumed)
 MOST_LISTED = 4
 LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
 MOSTLY_COVERED = 0.8
-"""Share of the judged time from which the drives do not limit the answer."""
+"""Share of the judged time from which the drives do not limit the answer (assumed)."""
 
 Cell = tuple[int, int, int]
 Samples = Counter[Cell]

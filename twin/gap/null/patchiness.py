@@ -17,12 +17,12 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.samples import Indices
+from terrafusion.twin.gap.null.channel_noise import ANY_SIZE
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun, whitened_columns
 
 FACTORS = np.append(0.0, np.geomspace(0.05, 3.0, 35))
 """1 sigma of patches that are tried, in that of `PATCH_SIGMAS`. No ground varies as much as the last: where
 that fits best, something else is the cause."""
-ANY_SIZE = 30.0  # 1 sigma of effects and functions of the commands beside patches, in their units (assumed)
 LEAST_VALUE = 1e-3  # information on a combination of patches from which it counts
 LEAST_RATIO, LEAST_FACTOR = 1.2, 0.1
 """Of a judged run's factor over the largest of the references, at least the second, from which its ground

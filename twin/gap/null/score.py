@@ -16,8 +16,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 EM_STEPS = 6
-PRIOR_RUNS = 3.0  # weight of the assumed variance of theta, in runs
-LEAST_SIGMA = 0.03  # least 1 sigma of theta, as a share of its unit
+PRIOR_RUNS = 3.0  # weight of the assumed variance of theta, in runs (assumed)
+LEAST_SIGMA = 0.03  # least 1 sigma of theta, as a share of its unit (assumed)
 REPLICATES = 20  # twin replicates that stand in for references
 
 

@@ -21,9 +21,9 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 
 HEAVY_TAILED = 0.02
-"""A channel is clipped where more than this share of the references' errors exceeds the limit."""
+"""A channel is clipped where more than this share (assumed) of the references' errors exceeds the limit."""
 CHANGED = 1.5
-"""Where half of the judged runs' errors exceed the noise by this factor, the runs themselves have changed:
+"""Where half of the judged runs' errors exceed the noise by this factor (assumed), the runs have changed:
 their limit is in their own sigmas."""
 NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation of normal errors
 

@@ -27,9 +27,10 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 
-MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's
+MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's (assumed)
 LIMIT_SIGMAS = 3.0
-"""A run's soil is also limited to so many sigmas of the references' soils: what goes beyond is a gap."""
+"""A run's soil is also limited to so many sigmas of the references' soils (assumed): what goes beyond is a
+gap."""
 STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
 """Most steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
 SHORTER, LEAST_STEP = 0.4, 0.1
