@@ -1,4 +1,4 @@
-"""`terrafusion gap-blind`: the diagnosis judged on sealed trials of a plant that is not the twin."""
+"""`terrafusion gap-blind`: the diagnosis judged on blind trials of a plant that is not the twin."""
 
 import math
 from functools import partial
@@ -51,7 +51,7 @@ def gap_blind(
         bool, typer.Option("--opponent/--no-opponent", help="Joint least squares on the same trials.")
     ] = True,
 ) -> Result:
-    """Judge the gap diagnosis on trials whose truth is sealed until all answers are given.
+    """Judge the gap diagnosis on trials whose truth it is not given, and which is fixed before the answers.
 
     The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
     Writes commitment.json first, answers.jsonl, then blind.json and report.html.

@@ -35,8 +35,8 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
     own = scores["figures"]["diagnosis"]
     lead = (
         f"{len(own['crashes'])} trials ended in a crash, which counts as a wrong answer. "
-        "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
-        f"all answers were in. Plant {plant_name(scores)}."
+        "The trials come from a plant that shares no equation with the twin; a salted hash of their labels "
+        f"was written before the answers. Plant {plant_name(scores)}."
     )
     write_page(
         out / "report.html", "blind.html.j2", f"Blind check of the diagnosis, {scores['trials']} trials",

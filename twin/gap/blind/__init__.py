@@ -1,1 +1,1 @@
-"""The blind check of the diagnosis: sealed trials made by a plant that is not the twin, answers, scores."""
+"""The blind check of the diagnosis: trials made by a plant that is not the twin, answers, scores."""

@@ -42,7 +42,7 @@ def run_blind_check(
     opponent: Diagnose | None = None,
     minutes: float = math.inf,
 ) -> dict[str, Any]:
-    """Scores of a diagnosis on sealed trials; `blind.json` in the folder `out` holds them too.
+    """Scores of a diagnosis on blind trials; `blind.json` in the folder `out` holds them too.
 
     Args:
         diagnose: the diagnosis to check, see `answers.Diagnose`.
