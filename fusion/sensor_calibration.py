@@ -34,9 +34,9 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, with_usable_samples
 from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
-from terrafusion.twin.model.choose import choose_vehicle
+from terrafusion.twin.model.choose import choose_vehicle, named_vehicle
 from terrafusion.twin.model.library import is_named
-from terrafusion.twin.model.vehicle import VehicleParams, reported_geometry
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, reported_geometry
 
 OBSERVED_NATS = 0.7
 """Least information by which a number counts as observed: its sigma is halved."""
@@ -185,7 +185,8 @@ def calibrate_sensors(
             earlier = learner.again(earlier, params) if learner.turned else learner
     last = earlier or learners[-1][1]
     logs = tuple(log.name for log, _ in learners)
-    extends = vehicle.name if isinstance(vehicle, VehicleParams) else str(vehicle or _named(recordings[0]))
+    named = vehicle or named_vehicle(recordings[0]) or "generic"
+    extends = named.name if isinstance(named, VehicleParams) else str(named)
     numbers = _numbers(before, last.known, params, yaw)
     if last.mounting.learns:
         known = (*last.mounting.level.known, last.mounting.known)
@@ -194,24 +195,24 @@ def calibrate_sensors(
     return SensorCalibration(params, extends, overrides, logs, numbers, notes)
 
 
-def _named(recording: Recording) -> str:
-    """The vehicle that a log names, where it is known, else the generic one."""
-    known = recording.vehicle and is_named("vehicles", recording.vehicle)
-    return str(recording.vehicle) if known else "generic"
-
-
 def _one_robot(recordings: Sequence[Recording], vehicle: object) -> Overrides:
     """The geometry that the logs report; refuses none, and those of several robots."""
     if not recordings:
         raise DataError("no log is given", remedy="give one or more of one robot")
     names = {recording.vehicle for recording in recordings}
-    if vehicle is None and len(names) > 1:
+    if vehicle is None and len(names) > 1 and not _one_vehicle(names):
         raise DataError(
             f"the logs name several vehicles: {', '.join(sorted(str(name) for name in names))}",
             file=recordings[-1].name,
             remedy="give logs of one, or say which with --vehicle",
         )
     return reported_geometry(recordings)
+
+
+def _one_vehicle(names: set[str | None]) -> bool:
+    """Whether names and files, such as the copies in log folders, stand for the same numbers."""
+    first, *others = [load_vehicle(name) if name and is_named("vehicles", name) else name for name in names]
+    return all(other == first for other in others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import repair_together, sorting
 from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
@@ -75,6 +76,9 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
             remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
+    vehicle = folder / expanded(meta.vehicle or "")
+    if vehicle.suffix in (".yaml", ".yml") and vehicle.is_file():
+        meta = dataclasses.replace(meta, vehicle=str(vehicle.resolve()))
     source = _Folder(folder, clocks)
     reader, channels = ChannelReader(source.table, meta), {}
     for name in CHANNELS:

@@ -1,5 +1,6 @@
 """Write a recording as a log folder; reading it back gives the same recording to the bit."""
 
+import dataclasses
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
 from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
+from terrafusion.datasets.writers.vehicle_copy import COPY, copy_vehicle, vehicle_file
 
 BLOCK_ROWS = 100_000
 """Rows that are turned into text at a time, which bounds the memory."""
@@ -28,9 +30,10 @@ BLOCK_ROWS = 100_000
 def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     """Write `meta.yaml` and one CSV a channel into `folder`, which is made where needed.
 
-    Values keep all their bits, times their nanoseconds; NaN becomes an empty cell. A log folder
-    that is already there is replaced. The log is written beside its place and moved there when it
-    is whole: a writer that fails or is stopped leaves no folder that could be taken for a log.
+    Values keep all their bits, times their nanoseconds; NaN becomes an empty cell. A vehicle file that the
+    recording names is copied into the folder, as `vehicle.yaml`. A log folder that is already there is
+    replaced. The log is written beside its place and moved there when it is whole: a writer that fails or
+    is stopped leaves no folder that could be taken for a log.
 
     Raises:
         DataError: `folder` is a file, or holds other things than a log; or the recording holds what
@@ -44,7 +47,9 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     _check_wheels(recording.wheels, folder)
     for name, table in tables.items():
         _check_table(table, recording.start_ns, folder, name)
-    meta = meta_of(recording, folder / META, folder.resolve().name)
+    vehicle = vehicle_file(recording.vehicle)
+    described = recording if vehicle is None else dataclasses.replace(recording, vehicle=COPY)
+    meta = meta_of(described, folder / META, folder.resolve().name)
     meta = finite(recording.metadata) | meta
     if not all(table.is_full() for table in tables.values()):
         meta["keep_empty"] = True
@@ -59,6 +64,8 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
             whole.mkdir()
             for name, table in tables.items():
                 _write_table(whole / f"{name}.csv", recording.start_ns, table)
+            if vehicle is not None:
+                copy_vehicle(vehicle, whole)
             (whole / META).write_text(text, encoding="utf-8", newline="\n")
             _put_in_place(whole, folder)
     return folder

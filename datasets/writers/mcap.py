@@ -22,6 +22,7 @@ from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
 from terrafusion.datasets.writers.mcap_file import Definition, TopicMessages, write_mcap_file
 from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
+from terrafusion.datasets.writers.vehicle_copy import vehicle_file
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
@@ -72,6 +73,8 @@ def write_mcap(
     with writing(path):
         if path.is_dir() or (path.exists() and not overwrite):
             raise DataError("exists already", file=path, remedy="remove it or give another name")
+        vehicle = vehicle_file(recording.vehicle)  # a bag has no folder of its own to copy it into
+        recording = dataclasses.replace(recording, vehicle=str(vehicle)) if vehicle else recording
         saved = meta_of(recording, path, path.stem)
         saved |= {"metadata": finite(recording.metadata)} if recording.metadata else {}
         shift_ns = _shift_ns(recording)

@@ -74,7 +74,7 @@ def init(
         result_lines,
     )
     from terrafusion.fusion.cli.inspect_page import print_lines
-    from terrafusion.fusion.init.vehicle import first_vehicle, generic_rig
+    from terrafusion.fusion.init.vehicle import base_of, first_vehicle, generic_rig
 
     answers = _answers(
         out,
@@ -92,6 +92,7 @@ def init(
     with decoded_once():
         first_log.topics = choose_sensors(log, parse_topics(how.topic))
         first = first_log.read(generic_rig())
+        _refuse_own_base(out, base_of(first))
         print_lines(contents_lines(first))
         answers = ask(answers, first_log.topics)
         with progress_bar("calibrating the sensors") as progress:
@@ -176,9 +177,22 @@ def _parsed(text: str, name: str) -> Any:
 
 def _write(out: Path, log: str, found: FirstVehicle) -> None:
     from terrafusion.fusion.init.draft import write_draft
+    from terrafusion.fusion.outputs.robot_file import seen_from
 
+    draft, base = found.draft, str(found.draft["extends"].value)
+    if Path(base).is_absolute():
+        draft = draft | {"extends": replace(draft["extends"], value=seen_from(out, Path(base)))}
     about = f"Vehicle file of the log '{found.recording.name}', written by: {command_line()}"
-    write_draft(out, found.draft, about)
+    write_draft(out, draft, about)
+
+
+def _refuse_own_base(out: Path, base: str) -> None:
+    """Refuse to write over the vehicle file that the log names, which the new one extends."""
+    from terrafusion.datasets.core.errors import ConfigError
+
+    if Path(base) == out.resolve():
+        what = "the log names this file as its vehicle, and the new file extends it"
+        raise ConfigError(what, file=out, remedy="give another --out")
 
 
 def _verdict(found: FirstVehicle, out: Path) -> Verdict:

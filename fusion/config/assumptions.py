@@ -87,7 +87,7 @@ def _of_the_vehicle(
     inputs: SensorConfig,
     used: Gnss | None,
 ) -> Iterator[Assumption]:
-    sources, shipped = _sources(asked, vehicle.name)
+    sources, shipped = _sources(asked or recording.vehicle, vehicle.name)
     wheels = recording.wheels
     needed = {
         "wheel_radius_m": wheels is not None and wheels.unit == "radps",

@@ -6,13 +6,15 @@ Each step opens or replays the log with the file as it is by then, so that what 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from terrafusion.datasets.checks import Finding, repair, run_checks
 from terrafusion.datasets.checks.measures import Measures, measure
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.scratch import scratch_folder
@@ -22,7 +24,8 @@ from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
 from terrafusion.fusion.init.geometry import geometry_lines, radius_line
 from terrafusion.fusion.init.level import measure_tilt, tilt_lines
 from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
-from terrafusion.twin.model.library import is_named
+from terrafusion.twin.model.choose import named_vehicle
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 Open = Callable[[Rig | None], Recording]
@@ -63,10 +66,15 @@ class FirstVehicle:
     notes: tuple[str, ...]
 
 
-def base_of(recording: Recording) -> VehicleParams:
-    """The vehicle that the file extends: the one that the log names, where it is known, else the generic."""
-    named = recording.vehicle and is_named("vehicles", recording.vehicle)
-    return load_vehicle(str(recording.vehicle) if named else "generic")
+def base_of(recording: Recording) -> str:
+    """The vehicle that the file extends: the one that the log names, where it is known, else the generic.
+
+    A name, or the absolute path of a vehicle file.
+    """
+    named = named_vehicle(recording)
+    if named is None:
+        return "generic"
+    return named if named in known_names("vehicles") else str(expanded(named).resolve())
 
 
 def generic_rig() -> Rig:
@@ -93,14 +101,15 @@ def first_vehicle(
         ConfigError: an answer is out of range.
     """
     _refuse_without_wheels(first)
-    base = base_of(first)
+    extended = base_of(first)
+    base = load_vehicle(extended)
     rig = _with_geometry(base.rig(), answers)
     recording = first if rig == generic_rig() else open_log(rig)
-    named = DraftLine(base.name, "what is not below is as of this vehicle")
+    named = DraftLine(extended, "what is not below is as of this vehicle")
     head: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
     tail = _messages(recording, answers)
     measured, geometry = _geometry(recording, answers, base, rig)
-    with scratch_folder() as folder:
+    with scratch_folder() as folder, _errors_of_log(folder, first.name):
         file = folder / "vehicle.yaml"
         mounted = _mounted(open_log, head | geometry | tail, file)
         if mounted.turned:  # what is measured about z holds only now
@@ -114,11 +123,22 @@ def first_vehicle(
             draft |= _learned_lines(calibration, draft)
             learned = load_vehicle(write_draft(file, draft, "draft")).rig()
             findings = tuple(run_checks(mounted.recording, learned))
-    if base.name != "generic":
-        known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
+    if extended != "generic":
+        known = f"the log names its vehicle '{base.name}': --vehicle {extended} needs no new file"
         notes = (known, *notes)
     notes = (*tilt_notes, *notes)
     return FirstVehicle(draft, mounted.recording, mounted.repaired, findings, measured, calibration, notes)
+
+
+@contextmanager
+def _errors_of_log(folder: Path, name: str) -> Iterator[None]:
+    """Attributes errors of files in the scratch folder to the log that their numbers are from."""
+    try:
+        yield
+    except ConfigError as error:
+        if error.file is None or folder not in Path(error.file).parents:
+            raise
+        raise ConfigError(error.what, file=name, channel=error.channel, remedy=error.remedy) from None
 
 
 def _geometry(

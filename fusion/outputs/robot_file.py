@@ -52,17 +52,16 @@ def _before(path: Path, vehicle: str) -> dict[str, Any]:
     if is_short(raw):
         robot = dict(raw["robot"])
         under = robot.get("extends", "generic")
-        return robot | {
-            "extends": under if under in vehicle_names() else _seen_from(path, old.parent / under)
-        }
+        return robot | {"extends": under if under in vehicle_names() else seen_from(path, old.parent / under)}
     if path.resolve() == old.resolve():
         raise ConfigError(
             "the calibrated file would overwrite the one it extends", file=path, remedy="give another --out"
         )
-    return {"extends": _seen_from(path, old)}
+    return {"extends": seen_from(path, old)}
 
 
-def _seen_from(path: Path, other: Path) -> str:
+def seen_from(path: Path, other: Path) -> str:
+    """What a vehicle file `path` calls another one that it extends."""
     return Path(os.path.relpath(other.resolve(), path.resolve().parent)).as_posix()
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.channels import Steering
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import STEERED_DRIVES
 from terrafusion.twin.model.library import is_named
@@ -33,13 +34,12 @@ def choose_vehicle(
 
     Raises:
         DataError: the log names no vehicle that is known, and lacks wheel radius or track.
-        ConfigError: an unknown vehicle is asked for.
+        ConfigError: an unknown vehicle is asked for, or the log names a file that is not there.
     """
     asked, overrides = vehicle, recording.overrides
     if overrides.drive is None and recording.steering is not None:
         overrides = dataclasses.replace(overrides, drive=_drive_of(recording.steering))
-    if not asked and recording.vehicle and is_named("vehicles", recording.vehicle):
-        asked = recording.vehicle
+    asked = asked or named_vehicle(recording)
     if asked:
         loaded = as_vehicle(asked)
         if loaded.drive.type in STEERED_DRIVES:
@@ -65,6 +65,22 @@ def choose_vehicle(
     if steered and wheelbase_m is None:
         track = f"its wheelbase of {chosen.body.wheelbase_m:g} m, {track}"
     return chosen, (f"{which}: the generic vehicle is used{given}; assumed are {track}its sensor noise",)
+
+
+def named_vehicle(recording: Recording) -> str | None:
+    """The vehicle that a log names, a name or a file, where it is known.
+
+    Raises:
+        ConfigError: the file is not there.
+    """
+    name = recording.vehicle
+    if not name or not is_named("vehicles", name):
+        return None
+    if name not in vehicle_names() and not expanded(name).exists():
+        what = f"the log names the vehicle file '{name}', which is not there"
+        remedy = "correct the path in its meta.yaml, or give --vehicle FILE"
+        raise ConfigError(what, file=recording.name, remedy=remedy)
+    return name
 
 
 def _drive_of(steering: Steering) -> str:
