@@ -21,9 +21,11 @@ from terrafusion.datasets.core.channels import (
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.quantity import shown
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.csv_table import ChannelColumns, CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
+from terrafusion.datasets.readers.text.fixes import with_assumed_sigma
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
 
@@ -40,6 +42,7 @@ GYRO = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps")
 ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
 FIELD = ("field_x_t", "field_y_t", "field_z_t")
 GNSS_POSITION = ("east_m", "north_m", "sigma_e_m", "sigma_n_m")
+GNSS_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
 GNSS_HEIGHT = ("up_m", "sigma_u_m")
 GNSS_VELOCITY = ("v_e_mps", "v_n_mps", "v_u_mps")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -65,7 +68,7 @@ COLUMNS = {
     "wheels": ChannelColumns(wheel_columns(WHEEL_LAYOUTS)),
     "imu": ChannelColumns((*GYRO, *ACCEL)),
     "gnss": ChannelColumns(
-        (*GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps"), ("fix",), required=GNSS_POSITION
+        (*GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps"), ("fix",), required=GNSS_POSITION[:2]
     ),
     "motor": ChannelColumns((*CURRENTS, *VOLTAGES), required=CURRENTS),
     "terrain": ChannelColumns((), ("label",), ("p_",), required=("label",)),
@@ -82,15 +85,21 @@ COLUMNS = {
 class ChannelReader:
     """Makes channels of tables; `notes` collects what was assumed or left out.
 
-    `tables` gives the table of a channel with columns of `COLUMNS`, None where there is none.
+    `tables` gives the table of a channel with columns of `COLUMNS`, None where there is none; `rig` the
+    sigmas of fixes that have none.
     """
 
     def __init__(
-        self, tables: Callable[[str], CsvTable | None], meta: Meta, layouts: Layouts = WHEEL_LAYOUTS
+        self,
+        tables: Callable[[str], CsvTable | None],
+        meta: Meta,
+        layouts: Layouts = WHEEL_LAYOUTS,
+        rig: Rig | None = None,
     ) -> None:
         self.tables = tables
         self.meta = meta
         self.layouts = layouts
+        self.rig = rig
         self.notes: list[str] = list(meta.remarks)
 
     def command(self) -> Command | None:
@@ -142,19 +151,35 @@ class ChannelReader:
         if table is None:
             return None
         has = table.numbers.__contains__
-        if has("up_m") != has("sigma_u_m"):
+        missing = [name for name in GNSS_SIGMA[:2] if not has(name)]
+        if missing and any(map(has, GNSS_SIGMA)):
+            needed = f"needed: t_s, {', '.join(GNSS_POSITION)}, or no sigma at all"
+            raise DataError(f"column '{missing[0]}' is missing", remedy=needed)
+        if has("up_m") != has("sigma_u_m") and not missing:
             raise DataError("up_m and sigma_u_m must come together", remedy="add the missing one")
         if has("v_e_mps") != has("v_n_mps") or (has("v_u_mps") and not has("v_e_mps")):
             remedy = "give v_e_mps and v_n_mps, or no velocity column"
             raise DataError("the velocity is incomplete", remedy=remedy)
+        position, fix = table.stack(("east_m", "north_m", "up_m")), self._fix(table)
         return Gnss(
             self._t(table),
-            table.stack(("east_m", "north_m", "up_m")),
-            table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m")),
-            self._fix(table),
+            position,
+            self._with_sigma(position, table.stack(GNSS_SIGMA), fix),
+            fix,
             table.stack(GNSS_VELOCITY) if has("v_e_mps") else None,
             table.numbers.get("sigma_v_mps"),
         )
+
+    def _with_sigma(self, position: Array, sigma: Array, fix: NDArray[np.uint8]) -> Array:
+        """Sigmas (N, 3) where those of fixes without one are filled; zero and negative ones stay."""
+        lacking = np.isnan(sigma[:, :2]).any(axis=1) & np.isfinite(position[:, :2]).all(axis=1)
+        lacking &= fix > Fix.NONE
+        if self.meta.keep_empty or not lacking.any():
+            return sigma
+        filled, notes = with_assumed_sigma(self.rig, sigma[lacking], fix[lacking])
+        self.notes += notes
+        sigma[lacking] = filled
+        return sigma
 
     def _fix(self, table: CsvTable) -> NDArray[np.uint8]:
         if "fix" not in table.texts:

@@ -17,6 +17,7 @@ from terrafusion.datasets.core.clock import repair_together, sorting
 from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
 from terrafusion.datasets.readers.csv_table import CsvTable, read_table, read_times
@@ -35,29 +36,32 @@ def claims(path: Path, head: bytes) -> bool:
 def read(request: Request) -> list[Recording]:
     """The one recording of a log folder."""
     try:
-        return [read_log_folder(request.path)]
+        return [read_log_folder(request.path, rig=request.rig)]
     except ClockError:
         if not request.repair_clock:
             raise
-    return [_with_clock_repaired(request.path)]
+    return [_with_clock_repaired(request.path, request.rig)]
 
 
-def _with_clock_repaired(folder: Path) -> Recording:
+def _with_clock_repaired(folder: Path, rig: Rig | None) -> Recording:
     """Read a log folder whose times run backwards somewhere."""
     files = _Folder(folder)
     paths = {channel: files.path(channel) for channel in CHANNELS}
     times = {channel: read_times(path) for channel, path in paths.items() if path is not None}
     clocks, jumps = repair_together(times)
-    recording = read_log_folder(folder, clocks)
+    recording = read_log_folder(folder, clocks, rig)
     moved = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + recording.start_ns) for jump in jumps)
     return dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))
 
 
-def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -> Recording:
+def read_log_folder(
+    folder: Path, clocks: Mapping[str, TimesNs] | None = None, rig: Rig | None = None
+) -> Recording:
     """Read a log folder.
 
     Args:
         clocks: times in ns from the start, by channel, in place of those of the files; one for each row.
+        rig: of the robot, whose receiver gives the sigmas of fixes without one.
 
     Returns:
         Recording named after the folder, times in ns from `start_ns`; its notes say what was
@@ -80,7 +84,7 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
     if vehicle.suffix in (".yaml", ".yml") and vehicle.is_file():
         meta = dataclasses.replace(meta, vehicle=str(vehicle.resolve()))
     source = _Folder(folder, clocks)
-    reader, channels = ChannelReader(source.table, meta), {}
+    reader, channels = ChannelReader(source.table, meta, rig=rig), {}
     for name in CHANNELS:
         with errors_of(source.path(name) or folder):
             channels[name] = getattr(reader, name)()

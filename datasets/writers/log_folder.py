@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.channels import Wheels
+from terrafusion.datasets.core.channels import Gnss, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
@@ -51,7 +51,7 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     described = recording if vehicle is None else dataclasses.replace(recording, vehicle=COPY)
     meta = meta_of(described, folder / META, folder.resolve().name)
     meta = finite(recording.metadata) | meta
-    if not all(table.is_full() for table in tables.values()):
+    if _lacks_sigma(recording.gnss) or not all(table.is_full() for table in tables.values()):
         meta["keep_empty"] = True
     text = _meta_text(meta, folder)
     _check_room(folder)
@@ -69,6 +69,11 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
             (whole / META).write_text(text, encoding="utf-8", newline="\n")
             _put_in_place(whole, folder)
     return folder
+
+
+def _lacks_sigma(gnss: Gnss | None) -> bool:
+    """Whether a fix has no sigma, which the reader would fill."""
+    return gnss is not None and bool(np.isnan(gnss.sigma_enu_m[:, :2]).any())
 
 
 def _check_room(folder: Path) -> None:

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
+from terrafusion.twin.model.vehicle import load_vehicle
 from tests.differences import differences
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
@@ -224,7 +225,7 @@ BAD_TABLES = {
     "mixed units": ("wheels", "t_s,left_radps,right_mps\n0,1,1\n", ["layout"]),
     "one angle": ("wheels", "t_s,left_radps,right_radps,left_rad\n0,1,1,1\n", ["right_rad"]),
     "stray angle": ("wheels", "t_s,speed_mps,left_rad\n0,1,1\n", ["left_rad"]),
-    "no sigma": ("gnss", "t_s,east_m,north_m\n0,1,1\n", ["sigma_e_m", "missing"]),
+    "one sigma": ("gnss", "t_s,east_m,north_m,sigma_n_m\n0,1,1,1\n", ["sigma_e_m", "missing", "or no sigma"]),
     "height alone": ("gnss", f"{GNSS},up_m\n0,1,1,1,1,1\n", ["sigma_u_m"]),
     "half velocity": ("gnss", f"{GNSS},v_e_mps\n0,1,1,1,1,1\n", ["v_n_mps"]),
     "fix word": ("gnss", f"{GNSS},fix\n0,1,1,1,1,rtk\n", ["'rtk'", "fixed"]),
@@ -328,3 +329,23 @@ def test_byte_order_mark_and_windows_line_ends(tmp_path: Path) -> None:
     imu = open_recording(folder).imu
     assert imu is not None
     assert imu.gyro_radps[:, 2].tolist() == [0.25, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("t_s,east_m,north_m,sigma_e_m,sigma_n_m,fix", "1,2,,,"),
+        ("t_s,east_m,north_m,up_m,fix", "1,2,3,"),
+    ],
+)
+def test_sigmas_that_are_missing_are_those_of_the_class(tmp_path: Path, header: str, row: str) -> None:
+    """As in tables: an empty cell, or no column at all."""
+    rows = f"0,{row}single\n1,{row}fixed\n"
+    folder = folder_with(tmp_path, gnss=f"{header}\n{rows}")
+    recording = open_recording(folder)
+    assert recording.gnss is not None
+    assert recording.gnss.sigma_enu_m[:, :2].tolist() == [[3.0, 3.0], [0.02, 0.02]]
+    assert any("gnss: 2 fixes have no sigma; taken from assumed by class" in note for note in recording.notes)
+    own = open_recording(folder, rig=load_vehicle("husky").rig())
+    assert own.gnss is not None
+    assert np.ptp(own.gnss.sigma_enu_m[:, 0]) == 0.0

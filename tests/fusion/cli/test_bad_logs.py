@@ -264,11 +264,12 @@ def test_a_bag_gets_no_impossible_numbers(case: str, good_log: Path, tmp_path: P
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_fixes_without_sigma_are_left_out(good_log: Path, tmp_path: Path, terrafusion) -> None:
-    """An empty cell is a missing value, no error: wheels and IMU alone are used, and that is said."""
+def test_fixes_without_sigma_have_that_of_their_class(good_log: Path, tmp_path: Path, terrafusion) -> None:
+    """An empty cell is a missing value, no error: the fixes are used, and what is assumed is said."""
     shutil.copytree(good_log, tmp_path / "log")
     cells("gnss.csv", "sigma_n_m", "", ALL)(tmp_path / "log")
-    assert "131 of 131 fixes have a sigma that is" in terrafusion("inspect", "log").out
+    assert "131 fixes have no sigma; taken from assumed by class" in terrafusion("inspect", "log").out
     outcome = terrafusion("replay", "log", "--out", "results")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "no usable GNSS fix" in outcome.out
+    assert "no usable GNSS fix" not in outcome.out
+    assert "131 fixes have no sigma" in outcome.out
