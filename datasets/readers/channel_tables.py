@@ -23,6 +23,7 @@ from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.core.wrapped_angles import unwrapped_beside_speeds
 from terrafusion.datasets.readers.csv_table import ChannelColumns, CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
 from terrafusion.datasets.readers.text.fixes import with_assumed_sigma
@@ -117,8 +118,13 @@ class ChannelReader:
         if present and missing:
             raise DataError(f"column '{missing[0]}' is missing beside '{present[0]}'", remedy="add it")
         speed = table.stack([f"{n}_{unit}" for n in names])
-        wheels = Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
-        if self.meta.keep_empty or not sampled_apart(wheels):
+        angle = table.stack(columns) if present else None
+        if self.meta.keep_empty:
+            return Wheels(self._t(table), speed, names, unit, angle)
+        angle, note = unwrapped_beside_speeds(angle, names)
+        self.notes += [f"wheels: {note}"] if note else []
+        wheels = Wheels(self._t(table), speed, names, unit, angle)
+        if not sampled_apart(wheels):
             return wheels
         self.notes.append(
             "wheels: left and right are sampled at different times; each is interpolated over its own samples"

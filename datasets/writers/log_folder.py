@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.channels import Gnss, Wheels
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED, is_part, scratch_folder, sweep
+from terrafusion.datasets.core.wrapped_angles import unwrapped
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
@@ -51,7 +52,7 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     described = recording if vehicle is None else dataclasses.replace(recording, vehicle=COPY)
     meta = meta_of(described, folder / META, folder.resolve().name)
     meta = finite(recording.metadata) | meta
-    if _lacks_sigma(recording.gnss) or not all(table.is_full() for table in tables.values()):
+    if _is_mended(recording) or not all(table.is_full() for table in tables.values()):
         meta["keep_empty"] = True
     text = _meta_text(meta, folder)
     _check_room(folder)
@@ -71,9 +72,12 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     return folder
 
 
-def _lacks_sigma(gnss: Gnss | None) -> bool:
-    """Whether a fix has no sigma, which the reader would fill."""
-    return gnss is not None and bool(np.isnan(gnss.sigma_enu_m[:, :2]).any())
+def _is_mended(recording: Recording) -> bool:
+    """Whether the reader would fill sigmas that are missing, or count the turns of angles that do not."""
+    gnss, wheels = recording.gnss, recording.wheels
+    if gnss is not None and np.isnan(gnss.sigma_enu_m[:, :2]).any():
+        return True
+    return wheels is not None and unwrapped(wheels.angle_rad, wheels.names)[1] != ""
 
 
 def _check_room(folder: Path) -> None:

@@ -22,6 +22,7 @@ from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permut
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.core.wrapped_angles import unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import (
     holding,
@@ -46,7 +47,8 @@ class ChannelBuilder:
     """Turns streams into channels; `notes` collects what was assumed or left out.
 
     `known` are the conventions of a catalogued bag: its track makes the side speeds where there is
-    no rig, and its IMU's axes are left to whoever applies the conventions.
+    no rig, and its IMU's axes are left to whoever applies the conventions. A bag of this library is read
+    `as_written`, to the bit.
     """
 
     file: Path
@@ -55,6 +57,7 @@ class ChannelBuilder:
     start_ns: int
     joints: dict[str, str]
     notes: list[str] = field(default_factory=list)
+    as_written: bool = False
 
     def command(self, stream: Stream, t_ns: TimesNs) -> Command:
         """Commanded twists."""
@@ -187,6 +190,12 @@ class ChannelBuilder:
         angle = joint_values(stream, [*joints.values()], "position")
         chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
         self.notes.append(f"wheels: joints of {stream.topic}: {chosen}")
+        if angle is not None and not self.as_written:
+            if speed is None:
+                angle, note = unwrapped_alone(angle, tuple(joints), stream.topic)
+            else:
+                angle, note = unwrapped_beside_speeds(angle, tuple(joints))
+            self.notes += [f"wheels: {stream.topic}: {note}"] if note else []
         if speed is None and angle is not None and len(t_ns) > 1:
             dt = np.diff(t_ns) * 1e-9
             keep = np.concatenate([[False], dt > 0])

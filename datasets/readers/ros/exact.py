@@ -94,7 +94,7 @@ def restore(
     found = read(asked)
     streams = {name: found[key] for name, key in keys.items() if key in there}
     tables = ChannelReader(_BagTables(saved, file, streams).table, saved.meta, LAYOUTS)
-    builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {})
+    builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {}, as_written=True)
     channels = {
         name: getattr(tables, name)()
         if name in saved.tables

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.channels import Fix, Wheels
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
@@ -349,3 +349,25 @@ def test_sigmas_that_are_missing_are_those_of_the_class(tmp_path: Path, header: 
     own = open_recording(folder, rig=load_vehicle("husky").rig())
     assert own.gnss is not None
     assert np.ptp(own.gnss.sigma_enu_m[:, 0]) == 0.0
+
+
+def test_angles_that_start_again_after_each_turn_count_turns(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f},9,9,{0.9 * k % (2 * np.pi)},{0.9 * k}\n" for k in range(100))
+    recording = open_recording(
+        folder_with(tmp_path, wheels=f"t_s,left_radps,right_radps,left_rad,right_rad\n{rows}")
+    )
+    assert recording.wheels is not None
+    np.testing.assert_allclose(recording.wheels.angle_rad, np.arange(100)[:, None] * [0.9, 0.9], atol=1e-9)
+    assert (
+        "wheels: the angles of left start again after each turn; whole turns are counted" in recording.notes
+    )
+
+
+def test_wrapped_angles_of_a_recording_are_written_and_read_to_the_bit(tmp_path: Path) -> None:
+    t_ns = np.arange(100) * 10**8
+    angle = np.stack([0.9 * np.arange(100) % (2 * np.pi)] * 2, axis=1)
+    wheels = Wheels(t_ns, np.full((100, 2), 9.0), ("left", "right"), "radps", angle)
+    recording = Recording("wrapped", 0, wheels=wheels)
+    assert differences(recording, open_recording(write_log_folder(recording, tmp_path / "wrapped"))) == []
+    write_mcap(recording, tmp_path / "wrapped.mcap")
+    assert differences(recording, open_recording(tmp_path / "wrapped.mcap")) == []

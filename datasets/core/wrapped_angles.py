@@ -1,0 +1,65 @@
+"""Encoder angles that start again after each turn, made to count whole turns.
+
+A log wraps its angles where all of one wheel lie in one turn and jump by nearly a turn; steps in between are
+small where samples follow each other fast enough.
+"""
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.errors import DataError
+
+TURN_RAD = 2.0 * np.pi
+NEARLY, LARGEST = 2.0 / 3.0, 1.0 / 3.0
+"""Turns: a step beyond the first is a jump to the other end, one beyond the second leaves its sense open."""
+MOST_LARGE = 2
+"""Steps above a third of a turn that a wheel can do without leaving the turn, unless it rocks."""
+WITHIN = 1.0 + 1e-6
+"""Turns that angles of single precision take of one."""
+
+
+def unwrapped(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | None, str]:
+    """Angles (N, wheels) with whole turns, and a note where any were wrapped; others keep their bits.
+
+    None where steps are too large to tell how far a wheel turned.
+    """
+    if angle_rad is None:
+        return None, ""
+    out, wrapped = angle_rad, []
+    for k, name in enumerate(names):
+        held = np.isfinite(angle_rad[:, k])
+        angle = angle_rad[held, k]
+        steps = np.diff(angle)
+        jumps, large = (np.count_nonzero(np.abs(steps) > share * TURN_RAD) for share in (NEARLY, LARGEST))
+        if not (jumps or large > MOST_LARGE) or np.ptp(angle) > WITHIN * TURN_RAD:
+            continue
+        turns = np.rint(steps / TURN_RAD)
+        if (np.abs(steps - TURN_RAD * turns) > LARGEST * TURN_RAD).any():
+            return None, (
+                f"the angles of {name} lie in one turn, and steps of more than a third of a turn leave open "
+                "how far it turned"
+            )
+        out = out.copy() if out is angle_rad else out
+        out[held, k] = angle - TURN_RAD * np.concatenate([[0.0], np.cumsum(turns)])
+        wrapped.append(name)
+    note = f"the angles of {', '.join(wrapped)} start again after each turn; whole turns are counted"
+    return out, note if wrapped else ""
+
+
+def unwrapped_beside_speeds(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | None, str]:
+    """As `unwrapped`; the note says that speeds take the place of angles that do not tell."""
+    angle, note = unwrapped(angle_rad, names)
+    return angle, f"{note}; only the speeds are used" if note and angle is None else note
+
+
+def unwrapped_alone(angle_rad: Array, names: tuple[str, ...], channel: str) -> tuple[Array, str]:
+    """As `unwrapped`, of a log without speeds.
+
+    Raises:
+        DataError: steps are too large to tell.
+    """
+    angle, note = unwrapped(angle_rad, names)
+    if angle is None:
+        remedy = "log wheel speeds, angles that count whole turns, or more samples a second"
+        raise DataError(note, channel=channel, remedy=remedy)
+    return angle, note

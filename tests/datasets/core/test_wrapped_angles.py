@@ -1,0 +1,62 @@
+"""Encoder angles that start again after each turn."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.wrapped_angles import (
+    TURN_RAD,
+    unwrapped,
+    unwrapped_alone,
+    unwrapped_beside_speeds,
+)
+
+STEPS = hnp.arrays(float, 200, elements=st.floats(-0.3 * TURN_RAD, 0.3 * TURN_RAD))
+
+
+@given(STEPS, st.sampled_from([0.0, -np.pi, 1.3]))
+def test_whole_turns_are_counted(steps: np.ndarray, start: float) -> None:
+    """Whatever the wheel does, where steps are below a third of a turn; [0, 2 pi), +-pi or another turn."""
+    true = start + np.concatenate([[0.5], 0.5 + np.cumsum(steps)])
+    wrapped = (true - start) % TURN_RAD + start
+    angle, note = unwrapped(wrapped[:, None], ("left",))
+    assert angle is not None
+    np.testing.assert_allclose(angle[:, 0] - angle[0, 0], true - true[0], atol=1e-9)
+    assert bool(note) == bool((np.abs(np.diff(wrapped)) > np.pi).any())
+
+
+@given(hnp.arrays(float, 50, elements=st.floats(-1e3, 1e3)))
+def test_angles_beyond_one_turn_are_returned_as_they_are(angle: np.ndarray) -> None:
+    both = np.stack([angle, np.linspace(0.0, 3.0, 50)], axis=1)
+    if np.ptp(angle) > 1.001 * TURN_RAD:
+        assert unwrapped(both, ("left", "right"))[0] is both
+
+
+def test_a_slow_log_of_less_than_a_turn_keeps_its_bits() -> None:
+    angle = np.array([[0.0], [0.0], [2.5], [2.5], [5.0], [5.1]])
+    assert unwrapped(angle, ("left",)) == (angle, "")
+
+
+def test_missing_cells_stay_missing_and_the_other_wheel_keeps_its_bits() -> None:
+    true = np.linspace(0.0, 40.0, 200)
+    wrapped = np.stack([true % TURN_RAD, true], axis=1)
+    wrapped[50:53, 0] = np.nan
+    angle, note = unwrapped(wrapped, ("left", "right"))
+    assert angle is not None
+    assert note == "the angles of left start again after each turn; whole turns are counted"
+    np.testing.assert_allclose(angle[:, 0], np.where(np.isnan(wrapped[:, 0]), np.nan, true))
+    assert angle[:, 1].tobytes() == true.tobytes()
+
+
+@pytest.mark.parametrize("turns", [0.35, 0.45, 0.6, 1.4])
+def test_steps_above_a_third_of_a_turn_leave_the_way_open(turns: float) -> None:
+    fast = np.arange(100)[:, None] * turns * TURN_RAD % TURN_RAD
+    angle, note = unwrapped_beside_speeds(fast, ("left",))
+    assert angle is None
+    assert "more than a third of a turn" in note
+    assert note.endswith("only the speeds are used")
+    with pytest.raises(DataError, match="leave open how far it turned; log wheel speeds"):
+        unwrapped_alone(fast, ("left",), "/joint_states")
