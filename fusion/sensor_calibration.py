@@ -168,7 +168,7 @@ def calibrate_sensors(
         ConfigError: an unknown vehicle, or a file with errors.
     """
     overrides = _one_robot(recordings, vehicle)
-    params, notes = choose_vehicle(recordings[0], vehicle)
+    params, notes = choose_vehicle(dataclasses.replace(recordings[0], overrides=overrides), vehicle)
     ready = [(log, _learner(log, params)) for log in recordings]
     left_out = [log.name for log, learner in ready if learner is None]
     notes += tuple(f"{name}: left out, it has no fixes or no source of yaw" for name in left_out)

@@ -77,7 +77,7 @@ def named_vehicle(recording: Recording) -> str | None:
     if not name or not is_named("vehicles", name):
         return None
     if name not in vehicle_names() and not expanded(name).exists():
-        what = f"the log names the vehicle file '{name}', which is not there"
+        what = f"the log names the vehicle file '{name}': no such file"
         remedy = "correct the path in its meta.yaml, or give --vehicle FILE"
         raise ConfigError(what, file=recording.name, remedy=remedy)
     return name

@@ -288,21 +288,25 @@ def _antenna_calibrated(vehicle: VehicleParams) -> bool:
 
 
 def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
-    """The geometry that logs of one vehicle report.
+    """The geometry that logs of one vehicle report; the drive that some leave out is that of the others.
 
     Raises:
         DataError: two of them differ.
     """
     first = recordings[0]
+    drive = next((r.overrides.drive for r in recordings if r.overrides.drive is not None), None)
+    reported = dataclasses.replace(first.overrides, drive=drive)
     for recording in recordings[1:]:
-        if recording.overrides != first.overrides:
+        own = dataclasses.replace(recording.overrides, drive=recording.overrides.drive or drive)
+        differing = [name for name, value in vars(own).items() if value != getattr(reported, name)]
+        if differing:
             raise DataError(
                 f"it reports another geometry of the vehicle ({listed_overrides(recording.overrides)}) than "
                 f"{first.name} ({listed_overrides(first.overrides)})",
                 file=recording.name,
-                remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
+                remedy=f"give logs of one vehicle, or the same {' and '.join(differing)} in their meta.yaml",
             )  # fmt: skip
-    return first.overrides
+    return reported
 
 
 def listed_overrides(overrides: Overrides) -> str:

@@ -85,7 +85,7 @@ def test_a_vehicle_file_that_is_gone_is_named_with_the_log(workshop: Path) -> No
     for command in (("init", "drive"), ("replay", "drive")):
         done = run(*command, "--out", "out.yaml")
         assert str(done.exception) == (
-            "chirp: the log names the vehicle file 'gone.yaml', which is not there; "
+            "chirp: the log names the vehicle file 'gone.yaml': no such file; "
             "correct the path in its meta.yaml, or give --vehicle FILE"
         )
 

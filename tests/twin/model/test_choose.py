@@ -13,7 +13,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES
 from terrafusion.twin.model.choose import choose_vehicle
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import load_vehicle, reported_geometry
 
 NAMELESS = Recording("run", 0)
 
@@ -111,3 +111,13 @@ def test_without_a_gyro_a_steered_robot_needs_its_wheelbase() -> None:
         choose_vehicle(STEERED)
     vehicle, notes = choose_vehicle(dataclasses.replace(STEERED, imu=GYRO))
     assert f"wheelbase of {vehicle.body.wheelbase_m:g} m" in notes[0]
+
+
+def test_logs_of_one_robot_may_leave_its_drive_out_but_not_differ() -> None:
+    tracked = Recording("monday", 0, overrides=Overrides(track_m=0.5, drive="tracked"))
+    silent = Recording("tuesday", 0, overrides=Overrides(track_m=0.5))
+    for logs in ([tracked, silent], [silent, tracked]):
+        assert reported_geometry(logs) == tracked.overrides
+    skid = Recording("friday", 0, overrides=Overrides(track_m=0.5, drive="skid_steer"))
+    with pytest.raises(DataError, match=r"friday: .*give logs of one vehicle, or the same drive in"):
+        reported_geometry([silent, tracked, skid])
