@@ -162,6 +162,8 @@ def _note(note: str | dict[str, Any], recordings: int) -> str:
 
 def _findings(page: dict[str, Any]) -> Iterator[Line]:
     yield "", ""
+    if "wheels" not in page["channels"]:
+        yield from entry("missing", "yellow", "wheels, which replay and init need")
     if not page["findings"]:
         yield "green", "no findings"
     for f in page["findings"]:

@@ -56,7 +56,7 @@ def with_usable_samples(
     Raises:
         DataError: wheels or, where `inputs` has one, the IMU are missing, or overlap for less than 2 s.
     """
-    wheels = _complete_wheels(recording.wheels)
+    wheels = _complete_wheels(wheels_of(recording))
     imu: Imu | None = None
     if inputs.imu == "none":
         if (wheels.t_ns[-1] - wheels.t_ns[0]) * 1e-9 < LEAST_OVERLAP_S:
@@ -80,13 +80,20 @@ def with_usable_samples(
     )
 
 
-def _complete_wheels(wheels: Wheels | None) -> Wheels:
-    if wheels is None or not len(wheels):
-        raise DataError(
-            "the log has no wheel speeds",
-            channel="wheels",
-            remedy="name their topic, or add wheels.csv",
-        )
+def wheels_of(recording: Recording) -> Wheels:
+    """The wheels of a log.
+
+    Raises:
+        DataError: it has none; with what the reader says of them and of a remedy.
+    """
+    if recording.wheels is not None and len(recording.wheels):
+        return recording.wheels
+    notes = [note.removeprefix("wheels: ") for note in recording.notes if note.startswith("wheels: ")]
+    remedy = "; ".join(notes) or "add wheels.csv to a log folder, or columns of wheels to a table"
+    raise DataError("the log has no wheel speeds", channel="wheels", remedy=remedy)
+
+
+def _complete_wheels(wheels: Wheels) -> Wheels:
     wheels = wheels.select(np.isfinite(wheels.speed.sum(axis=1)))
     if not len(wheels):
         raise DataError("no sample has all its values", channel="wheels")

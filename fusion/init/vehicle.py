@@ -13,12 +13,13 @@ from pathlib import Path
 
 from terrafusion.datasets.checks import Finding, repair, run_checks
 from terrafusion.datasets.checks.measures import Measures, measure
-from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.estimator.feed import wheels_of
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
 from terrafusion.fusion.init.geometry import geometry_lines, radius_line
@@ -100,7 +101,8 @@ def first_vehicle(
         DataError: the log cannot be read, or is wrong in a way that no repair removes.
         ConfigError: an answer is out of range.
     """
-    _refuse_without_wheels(first)
+    with errors_of(first.name):
+        wheels_of(first)
     extended = base_of(first)
     base = load_vehicle(extended)
     rig = _with_geometry(base.rig(), answers)
@@ -164,18 +166,6 @@ def _messages(recording: Recording, answers: Answers) -> Draft:
     if answers.topics:
         lines["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
     return lines
-
-
-def _refuse_without_wheels(recording: Recording) -> None:
-    """Raises DataError where nothing can be measured, with what the reader says of wheels."""
-    if recording.wheels is None or not len(recording.wheels):
-        notes = [note for note in recording.notes if note.startswith("wheels: ")]
-        raise DataError(
-            "; ".join(["the log has no wheel speeds", *notes]),
-            file=recording.name,
-            channel="wheels",
-            remedy="name their topic with --topic wheels=/NAME, or add wheels.csv to a log folder",
-        )
 
 
 def _with_geometry(rig: Rig, answers: Answers) -> Rig:

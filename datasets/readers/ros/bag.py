@@ -30,6 +30,7 @@ from terrafusion.datasets.readers.ros.topics import (
     choose_topics,
     joints_given,
 )
+from terrafusion.datasets.readers.ros.wheel_advice import wheel_advice
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
@@ -110,6 +111,9 @@ def _recording(container: BagContainer, request: Request) -> Recording:
             f"no topic of a type this library uses; topics here: {seen}",
             remedy="name one with --topic, such as --topic imu=/imu/data",
         )
+    if "wheels" not in chosen:
+        taken = [topic.name for kind, topic in chosen.items() if kind not in ("command", "steering")]
+        notes.append(wheel_advice(topics_of(container), taken, functools.partial(_joints, container)))
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
     start_ns = min(int(t[0]) for t in timing.times.values())

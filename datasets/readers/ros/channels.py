@@ -139,6 +139,8 @@ class ChannelBuilder:
         twist, variance = twists(stream)
         v, rate = twist[:, 0], twist[:, 5]
         self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
+        if stream.msgtype == topics.TWIST:
+            self.notes.append(f"wheels: {stream.topic} has no stamps; its times are those of arrival")
         if stream.msgtype == topics.ODOMETRY and not twist.any():
             position, _, _ = poses(stream)
             if np.nanmax(np.ptp(position[:, :2], axis=0), initial=0.0) > 1.0:

@@ -25,7 +25,7 @@ STRING = "std_msgs/msg/String"
 
 TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
-    "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
+    "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN, TWIST),
     "gnss": (FIX,),
     "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
     "command": (TWIST_STAMPED, TWIST),
@@ -139,7 +139,7 @@ def _choice_notes(
     if taken is not None and left:
         yield f"{kind}: took {taken.name} ({taken.count} messages), left {', '.join(left)}"
     elif taken is None and kind in ("wheels", "gnss"):
-        fused = [t.name for t in found if _is_fused(kind, t)]
+        fused = [t.name for t in found if looks_fused(kind, t)]
         if fused:
             yield (
                 f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "
@@ -184,7 +184,8 @@ def _asked_for(bag: list[BagTopic], kind: str, name: str) -> BagTopic:
     raise DataError(what, channel=kind, remedy=remedy)
 
 
-def _is_fused(kind: str, topic: BagTopic) -> bool:
+def looks_fused(kind: str, topic: BagTopic) -> bool:
+    """Whether a topic looks like an estimate, which is no sensor."""
     if kind == "gnss":
         return bool(re.search(r"filter|fused|ekf", topic.name, re.IGNORECASE))
     return topic.msgtype != JOINTS and bool(_FUSED.search(topic.name)) and not _TRUTH.search(topic.name)
@@ -196,7 +197,7 @@ def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool
         return bool(_NAMED[kind].search(name))
     if kind in ("imu", "barometer", "magnetometer"):
         return True
-    if _TRUTH.search(name) or _is_fused(kind, topic):
+    if _TRUTH.search(name) or looks_fused(kind, topic):
         return False
     if kind == "gnss":
         return not _DATUM.search(name)
@@ -204,6 +205,8 @@ def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool
         return has_joints(name)
     if topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED):  # mostly a command, which is no measurement
         return not _COMMAND.search(name)
+    if topic.msgtype == TWIST:  # mostly a command, and without a time: only on request
+        return False
     if topic.msgtype in (TWIST_STAMPED, TWIST_COVARIANCE):
         return bool(_WHEEL.search(name)) and not _COMMAND.search(name)
     return True

@@ -172,7 +172,7 @@ def test_what_is_wrong_is_one_line(drive: Recording, tmp_path: Path, monkeypatch
     still = write_log_folder(dataclasses.replace(drive, wheels=None), tmp_path / "still")
     done = run(still)
     assert done.exit_code == 1
-    assert "no wheel speeds; name their topic" in str(done.exception)
+    assert "no wheel speeds; add wheels.csv" in str(done.exception)
     for flag, text, expected in (
         ("--drive", "skid", "skid_steer"),
         ("--track", "51cm", "0.12:data_sheet"),
