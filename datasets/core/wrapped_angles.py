@@ -6,7 +6,7 @@ small where samples follow each other fast enough.
 
 import numpy as np
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.errors import DataError
 
 TURN_RAD = 2.0 * np.pi
@@ -63,3 +63,11 @@ def unwrapped_alone(angle_rad: Array, names: tuple[str, ...], channel: str) -> t
         remedy = "log wheel speeds, angles that count whole turns, or more samples a second"
         raise DataError(note, channel=channel, remedy=remedy)
     return angle, note
+
+
+def speeds_of(t_ns: TimesNs, angle_rad: Array) -> tuple[Mask, Array]:
+    """Rows (N,) with a row before them at an earlier time, and the mean speeds (M, wheels) since, rad/s."""
+    dt_s = np.diff(t_ns) * 1e-9
+    later = dt_s > 0.0
+    speed = np.diff(angle_rad, axis=0)[later] / dt_s[later, None]
+    return np.concatenate([[False], later]), speed

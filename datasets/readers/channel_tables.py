@@ -23,7 +23,7 @@ from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.core.wrapped_angles import unwrapped_beside_speeds
+from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.csv_table import ChannelColumns, CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
 from terrafusion.datasets.readers.text.fixes import with_assumed_sigma
@@ -111,6 +111,9 @@ class ChannelReader:
         table = self._table("wheels")
         if table is None:
             return None
+        alone = [names for names, _ in self.layouts if {f"{n}_rad" for n in names} == {*table.numbers}]
+        if alone:
+            return self._wheels_of_angles(table, alone[0])
         names, unit = self._wheel_layout(table)
         columns = [f"{n}_rad" for n in names]
         present = [c for c in columns if c in table.numbers]
@@ -130,6 +133,17 @@ class ChannelReader:
             "wheels: left and right are sampled at different times; each is interpolated over its own samples"
         )
         return paired_sides(wheels)
+
+    def _wheels_of_angles(self, table: CsvTable, names: tuple[str, ...]) -> Wheels:
+        """Wheels of a table that has angles alone."""
+        columns = [f"{name}_rad" for name in names]
+        angle = table.stack(columns)
+        held = np.isfinite(angle).all(axis=1)
+        angle, note = unwrapped_alone(angle[held], names, ", ".join(columns))
+        keep, speed = speeds_of(self._t(table)[held], angle)
+        self.notes += [f"wheels: {note}"] if note else []
+        self.notes.append("wheels: no speeds are there; they are differences of the angles")
+        return Wheels(self._t(table)[held][keep], speed, names, "radps", angle[keep])
 
     def _wheel_layout(self, table: CsvTable) -> tuple[tuple[str, ...], str]:
         speeds = [c for c in table.numbers if not c.endswith("_rad")]

@@ -22,7 +22,7 @@ from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permut
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.core.wrapped_angles import unwrapped_alone, unwrapped_beside_speeds
+from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import (
     holding,
@@ -199,11 +199,8 @@ class ChannelBuilder:
                 angle, note = unwrapped_beside_speeds(angle, tuple(joints))
             self.notes += [f"wheels: {stream.topic}: {note}"] if note else []
         if speed is None and angle is not None and len(t_ns) > 1:
-            dt = np.diff(t_ns) * 1e-9
-            keep = np.concatenate([[False], dt > 0])
-            speed = np.full_like(angle, np.nan)
-            speed[keep] = np.diff(angle, axis=0)[dt > 0] / dt[dt > 0, None]
-            speed, angle, t_ns = speed[keep], angle[keep], t_ns[keep]
+            keep, speed = speeds_of(t_ns, angle)
+            angle, t_ns = angle[keep], t_ns[keep]
             self.notes.append(
                 f"wheels: {stream.topic} has no velocities; taken from differences of the angles"
             )

@@ -2,8 +2,7 @@
 
 import dataclasses
 import difflib
-import json
-import re
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated, Any
 from terrafusion.datasets.core.config import Prepared, refuse, structure
 from terrafusion.datasets.core.conventions import BODY_AXES, HELD_CHANNELS, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
-from terrafusion.datasets.core.quantity import Quantity, Word, shown
+from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS
@@ -48,12 +47,40 @@ _BY_NAME = Prepared(_section, {"type": ["string", "integer"]})
 
 
 @dataclass(frozen=True)
+class _Scale(Parsed):
+    """A number, or the quotient of two as a text."""
+
+    def hint(self) -> str:
+        return "a number that is not 0, or a quotient such as 1/1024"
+
+    def parse(self, raw: Any) -> float:
+        parts = raw.split("/") if isinstance(raw, str) else [raw]
+        try:
+            if any(isinstance(part, bool) for part in parts) or len(parts) > 2:
+                raise ValueError
+            numbers = [float(part) for part in parts]
+            scale = numbers[0] / numbers[1] if len(numbers) == 2 else numbers[0]
+        except (TypeError, ValueError, ArithmeticError):
+            scale = math.nan
+        if not scale or not math.isfinite(scale):
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}'", f"give {self.hint()}")
+        return scale
+
+    def schema(self) -> dict[str, Any]:
+        return {"type": ["number", "string"], "description": self.hint()}
+
+
+@dataclass(frozen=True)
 class MappedColumn:
-    """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way."""
+    """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way.
+
+    The numbers of the column, times `scale`, are in the unit.
+    """
 
     column: str
     unit: str = ""
     sign: Annotated[str, Word(("+", "-"))] = "+"
+    scale: Annotated[float, _Scale()] = 1.0
 
 
 @dataclass(frozen=True)
@@ -146,50 +173,6 @@ def _owner(name: str, names: list[str]) -> str | None:
     return owners[0] if owners else "terrain" if name.startswith("p_") else None
 
 
-def starter_map(names: list[str]) -> str:
-    """A first column map for these columns, on one line, for the user to correct."""
-    time = next((n for n in names if re.search(r"time|stamp|^t(_|$)|sec", n, re.I)), names[0])
-    channels: dict[str, dict[str, str]] = {}
-    for name in names:
-        field_of = next((f for pattern, f in GUESSES if re.fullmatch(pattern, name, re.I)), None)
-        if name != time and field_of and field_of[1] not in channels.get(field_of[0], {}):
-            channels.setdefault(field_of[0], {})[field_of[1]] = name
-    channels = channels or {"imu": {"gyro_z_radps": names[-1]}}
-    sections = ", ".join(
-        f"{channel}: {{{', '.join(f'{f}: {json.dumps(n)}' for f, n in fields.items())}}}"
-        for channel, fields in channels.items()
-    )
-    return f"time: {{column: {json.dumps(time)}, unit: s, epoch: unix}}, channels: {{{sections}}}"
-
-
-_UNIT = r"(?:_\w+| ?[\[(].*)?"
-_LEFT, _RIGHT = r"(?:l|left)", r"(?:r|right)"
-GUESSES: tuple[tuple[str, tuple[str, str]], ...] = (
-    (r"lat(?:itude)?(?:_deg)?", ("gnss", "latitude_deg")),
-    (r"(?:lon|lng|long|longitude)(?:_deg)?", ("gnss", "longitude_deg")),
-    (r"(?:alt|altitude|height)(?:_m)?", ("gnss", "height_m")),
-    *(
-        (rf"(?:g|gyr|gyro|w|omega|angular_velocity)[_. ]?{a}{_UNIT}", ("imu", f"gyro_{a}_radps"))
-        for a in "xyz"
-    ),
-    *(
-        (rf"(?:a|acc|accel|acceleration|linear_acceleration)[_. ]?{a}{_UNIT}", ("imu", f"accel_{a}_mps2"))
-        for a in "xyz"
-    ),
-    *(
-        (rf"(?:v|vel|speed|wheel)[_. ]?{side}|{side}[_. ]?(?:v|vel|velocity|speed|wheel)", ("wheels", to))
-        for side, to in ((_LEFT, "left_mps"), (_RIGHT, "right_mps"))
-    ),
-    *(
-        (rf"(?:i|cur|current)[_. ]?{side}|{side}[_. ]?(?:i|cur|current)", ("motor", to))
-        for side, to in ((_LEFT, "left_a"), (_RIGHT, "right_a"))
-    ),
-    *((rf"(?:pos|position|truth)?[_. ]?{a}(?:_m)?", ("truth", f"{a}_m")) for a in "xyz"),
-    (r"yaw(?:_rad)?|heading", ("truth", "yaw_rad")),
-)
-"""Names of columns that people often use, and the field they may stand for."""
-
-
 def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
     """What is wrong beyond single values, and the remedy."""
     if found.time.epoch not in EPOCHS and not _is_instant(found.time.epoch):
@@ -234,6 +217,8 @@ def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple
         yield f"'{here}' is in the unit '{shown(of.unit)}'", remedy
     if name in TEXT_FIELDS and of.sign != "+":
         yield f"'{here}' has the sign '-', but is a text", "leave the sign out"
+    if name in TEXT_FIELDS and of.scale != 1.0:
+        yield f"'{here}' has a scale, but is a text", "leave the scale out"
 
 
 def _is_instant(text: str) -> bool:

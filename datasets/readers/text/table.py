@@ -28,10 +28,10 @@ from terrafusion.datasets.readers.text.column_map import (
     MappedColumn,
     contract_map,
     read_column_map,
-    starter_map,
 )
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.text.parquet import ParquetColumns
+from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
 from terrafusion.datasets.readers.text.text_columns import TextColumns
 from terrafusion.datasets.readers.text.units import units_of
@@ -83,7 +83,7 @@ def read(request: Request) -> list[Recording]:
         column_map = contract_map(columns.names)
         notes = ["columns are known by the log folder's names for them"]
     if column_map is None:
-        raise _mapless(path, columns.names)
+        raise _mapless(path, columns.names, columns.first_cells() if isinstance(columns, TextColumns) else [])
     for name in column_map.columns():
         if name not in columns.names:
             few = ", ".join(columns.names[:SHOWN_COLUMNS])
@@ -92,12 +92,15 @@ def read(request: Request) -> list[Recording]:
     return [_recording(request, columns, column_map, notes)]
 
 
-def _mapless(path: Path, names: list[str]) -> DataError:
+def _mapless(path: Path, names: list[str], first: list[str]) -> DataError:
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
+    proposal = starter_map(names, first)
+    ticks = f" ({TICKS}: how many ticks make a turn?)" if TICKS in proposal else ""
     return DataError(
         f"nothing says what the columns {', '.join(names)} are",
-        remedy=f"correct this and save it as {path.name}{MAP_SUFFIX}: {{{starter_map(names)}}}",
+        remedy=f"correct this proposal, whose fields and units are guesses{ticks} (entries: Plain tables in "
+        f"docs/reference/formats.md), and save it as {path.name}{MAP_SUFFIX}: {{{proposal}}}",
     )
 
 
@@ -180,7 +183,7 @@ class _Source:
 
     def _numbers(self, name: str, of: MappedColumn) -> Array:
         values = self.columns.numbers(of.column)[self.times.order]
-        factor = units_of(name).get(of.unit, 1.0) * (-1.0 if of.sign == "-" else 1.0)
+        factor = units_of(name).get(of.unit, 1.0) * (-of.scale if of.sign == "-" else of.scale)
         return values if factor == 1.0 else values * factor
 
     def _texts(self, name: str, of: MappedColumn) -> NDArray[Any]:

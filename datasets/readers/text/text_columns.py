@@ -1,5 +1,7 @@
 """Columns of a plain text table, and where its header is."""
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ from terrafusion.datasets.readers.delimited import (
 from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
 
 COMMENT = "#"
+SAMPLE_ROWS = 200
+"""Rows that tell a decimal comma."""
+_COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
 class TextColumns:
@@ -34,6 +39,7 @@ class TextColumns:
         self._data = read_text(path)
         self._layout = _layout(self._data, column_map)
         self.names = list(self._layout.names)
+        self._data, self._commas = _with_points(self._data, self._layout)
         self.notes: tuple[str, ...] = ()
 
     def read(self, names: list[str]) -> None:
@@ -43,7 +49,11 @@ class TextColumns:
         texts |= {of.column for fields in channels for name, of in fields.items() if name in TEXT_FIELDS}
         numbers = [name for name in names if name not in texts]
         self._table = read_columns(self.path, self._data, self._layout, numbers, sorted(texts))
-        self.notes = self._table.notes
+        self.notes = (*self._table.notes, *(["numbers have decimal commas"] if self._commas else []))
+
+    def first_cells(self) -> list[str]:
+        """The cells of the first row; [] where there is none."""
+        return next(_sample(self._data, self._layout), [])
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
@@ -83,6 +93,26 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     if repeated:
         raise DataError(f"column '{repeated}' comes twice", remedy="rename one of them")
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
+
+
+def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
+    """The cells of the first rows."""
+    for number, line in head_lines(data, layout.first_line + SAMPLE_ROWS):
+        if number >= layout.first_line and line.strip() and not line.startswith(COMMENT):
+            yield split(line, layout.separator)
+
+
+def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
+    """The text with points for decimal commas, and whether it had any: no cell may have a decimal point."""
+    if layout.separator == ",":
+        return data, False
+    cells = [cell for row in _sample(data, layout) for cell in row]
+    if not any(map(_COMMA.fullmatch, cells)) or any(map(_POINT.fullmatch, cells)):
+        return data, False
+    begin = 0
+    for _ in range(layout.first_line - 1):
+        begin = data.find(b"\n", begin) + 1
+    return data[:begin] + data[begin:].replace(b",", b"."), True
 
 
 def _is_row(cells: list[str]) -> bool:

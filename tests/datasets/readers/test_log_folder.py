@@ -371,3 +371,14 @@ def test_wrapped_angles_of_a_recording_are_written_and_read_to_the_bit(tmp_path:
     assert differences(recording, open_recording(write_log_folder(recording, tmp_path / "wrapped"))) == []
     write_mcap(recording, tmp_path / "wrapped.mcap")
     assert differences(recording, open_recording(tmp_path / "wrapped.mcap")) == []
+
+
+def test_angles_alone_give_the_speeds(tmp_path: Path) -> None:
+    rows = "0,0,0\n0.1,0.5,1\n0.1,0.5,1\n0.2,,\n0.3,1.5,3\n"
+    recording = open_recording(folder_with(tmp_path, wheels=f"t_s,left_rad,right_rad\n{rows}"))
+    wheels = recording.wheels
+    assert wheels is not None
+    np.testing.assert_allclose(wheels.speed, [[5, 10], [5, 10]])
+    assert wheels.angle_rad is not None
+    assert wheels.angle_rad.tolist() == [[0.5, 1], [1.5, 3]]
+    assert "wheels: no speeds are there; they are differences of the angles" in recording.notes

@@ -18,7 +18,8 @@ from terrafusion.datasets.core.errors import ConfigError, DataError, Terrafusion
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import files_of, open_recording
-from terrafusion.datasets.readers.text.column_map import FIELDS, starter_map
+from terrafusion.datasets.readers.text.column_map import FIELDS
+from terrafusion.datasets.readers.text.proposed_map import starter_map
 from terrafusion.datasets.readers.text.units import UNITS, units_of
 
 START_NS = 1_700_000_000_123_456_789
@@ -312,6 +313,7 @@ WRONG_MAPS = {
     "unknown channel": (GYRO_MAP.replace("imu", "inu"), "unknown channel 'inu'"),
     "unknown field": (GYRO_MAP.replace("gyro_z", "gyro_w"), "unknown field.*did you mean 'gyro_"),
     "unknown unit": (GYRO_MAP.replace("wz}", "{column: wz, unit: dps}}"), "'dps'; give one of rad/s, deg/s"),
+    "no scale": (GYRO_MAP.replace("wz}", "{column: wz, scale: 1/0}}"), "scale.*quotient such as 1/1024"),
     "unknown sign": (GYRO_MAP.replace("wz}", "{column: wz, sign: -1}}"), "sign"),
     "unknown time unit": (GYRO_MAP.replace("t}", "t, unit: min}"), "time.unit.*one of s, ms, us, ns, iso"),
     "an epoch that is no date": (GYRO_MAP.replace("t}", "t, epoch: '2024-13-01'}"), "time.epoch"),
@@ -439,3 +441,69 @@ def test_a_comment_mark_inside_a_cell_is_no_comment(tmp_path: Path) -> None:
 def test_half_a_position_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="only one of latitude_deg and longitude_deg"):
         open_recording(table(tmp_path, "t_s,latitude_deg,gyro_z_radps\n0,48.0,0.1\n1,48.0,0.1\n", None))
+
+
+HEADERS = {
+    "brackets": (
+        "timestamp [ms];wx [deg/s];wz [deg/s];ax [m/s^2];left ticks;right ticks;vl [m/s];vr [km/h];"
+        "Latitude [deg];Longitude [deg];Altitude [m];fix",
+        "1714564800000.5;0;90;1;5;6;2;7.2;48;11;500;4",
+    ),
+    "suffixes": (
+        "stamp_ns,gyro_z_deg_s,acc_z_g,v_left_kmh,v_right_kmh,lat,lon,alt_mm",
+        "1714564800000500000,90,1,7.2,7.2,48,11,500000",
+    ),
+    "milliseconds": (
+        "timestamp_ms,imu.gyro.z,speed,gps_lat,gps_lon",
+        "1714564800000.5,1.5707963267948966,2,48,11",
+    ),
+    "no unit of time": ("t,yaw_rate_dps,speed_mps,lat,lon", "1714564800000.5,90,2,48,11"),
+    "decimal commas": ("time;gz [deg/s];speed;lat;lon", "1714564800,0005;90,0;2,0;48,0;11,0"),
+}
+
+
+@pytest.mark.parametrize("case", HEADERS)
+def test_the_proposed_map_reads_units_in_headers(tmp_path: Path, case: str) -> None:
+    header, row = HEADERS[case]
+    path = table(tmp_path, f"{header}\n{row}\n", None)
+    with pytest.raises(DataError, match="this proposal, whose fields and units are guesses") as told:
+        open_recording(path)
+    (tmp_path / "drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    recording = open_recording(path)
+    assert recording.start_ns == 1_714_564_800_000_500_000
+    assert recording.imu is not None
+    assert recording.imu.gyro_radps[0, 2] == pytest.approx(np.pi / 2)
+    assert recording.wheels is not None
+    assert recording.wheels.speed[0].tolist() == pytest.approx([2.0] * len(recording.wheels.names))
+    assert recording.gnss is not None
+    if "acc_z" in header:
+        assert recording.imu.accel_mps2[0, 2] == 9.80665
+    assert any("decimal commas" in note for note in recording.notes) == (case == "decimal commas")
+
+
+def test_ticks_are_proposed_as_angles_with_a_scale(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f},{512 * k},{1024 * k}\n" for k in range(20))
+    path = table(tmp_path, f"t,left_ticks,right_ticks\n{rows}", None)
+    with pytest.raises(DataError, match="how many ticks make a turn") as told:
+        open_recording(path)
+    assert "gyro" not in str(told.value)
+    (tmp_path / "drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    recording = open_recording(path)
+    assert recording.wheels is not None
+    np.testing.assert_allclose(recording.wheels.speed, np.tile([10 * np.pi, 20 * np.pi], (19, 1)))
+    assert "wheels: no speeds are there; they are differences of the angles" in recording.notes
+
+
+@pytest.mark.parametrize(("scale", "factor"), [("1/1024", 1 / 1024), ("'-3/4'", -0.75), ("2.5", 2.5)])
+def test_a_scale_multiplies_a_column(tmp_path: Path, scale: str, factor: float) -> None:
+    columns = GYRO_MAP.replace("wz}", f"{{column: wz, unit: rev/s, scale: {scale}}}}}")
+    imu = open_recording(table(tmp_path, "t,wz\n0,8\n", columns)).imu
+    assert imu is not None
+    assert imu.gyro_radps[0, 2] == pytest.approx(16 * np.pi * factor)
+
+
+def test_a_comma_between_words_is_no_decimal_comma(tmp_path: Path) -> None:
+    columns = "time: {column: t}\nchannels: {imu: {gyro_z_radps: wz}, terrain: {label: ground}}\n"
+    recording = open_recording(table(tmp_path, "t;wz;ground\n0.5;1;mud, wet\n", columns))
+    assert recording.terrain is not None
+    assert recording.terrain.label[0] == "mud, wet"

@@ -1,0 +1,220 @@
+"""A first column map for a table without one, guessed from the names of its columns."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS
+from terrafusion.datasets.readers.text.units import units_of
+
+TICKS = "1/1024"
+"""Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
+_WORDS = {
+    "deg/s": "deg/s|°/s|dps|degps|degs|deg_s|deg_per_s|deg/sec",
+    "rad/s": "rad/s|radps|rads|rad_s|rad/sec",
+    "rpm": "rpm|1/min|u/min",
+    "rev/s": "rev/s|rps|revps",
+    "m/s": "m/s|mps|m_s|m/sec",
+    "km/h": "km/h|kmh|kph|kmph|km_h",
+    "cm/s": "cm/s|cmps|cm_s",
+    "mm/s": "mm/s|mmps|mm_s",
+    "mph": "mph",
+    "kn": "kn|kt|kts|knots",
+    "m/s2": "m/s2|m/s^2|m/s²|m/s/s|mps2|m_s2|ms2|ms-2",
+    "g": "g",
+    "mg": "mg",
+    "m": "m|meter|metre|meters|metres",
+    "km": "km",
+    "cm": "cm",
+    "mm": "mm",
+    "ft": "ft|feet",
+    "rad": "rad",
+    "deg": "deg|°|degree|degrees",
+    "1e-7 deg": "1e-7 deg|1e-7deg|deg*1e7|dege7|e7",
+    "rev": "rev|turns",
+    "A": "a|amp|amps",
+    "mA": "ma",
+    "Pa": "pa",
+    "hPa": "hpa",
+    "ticks": "ticks?|counts?|pulses?",
+    "s": "s|sec|secs|seconds",
+    "ms": "ms|msec|millis",
+    "us": "us|µs|usec|micros",
+    "ns": "ns|nsec|nanos|nanosec",
+}
+UNIT_OF = {word.removesuffix("?"): unit for unit, words in _WORDS.items() for word in words.split("|")} | {
+    "tick": "ticks",
+    "count": "ticks",
+    "pulse": "ticks",
+}
+"""Units as headers write them, in brackets or behind an underscore."""
+TIME_UNITS = ("s", "ms", "us", "ns")
+_BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
+_TIME = re.compile(r"(^|_)(time|timestamp|stamp|t|sec|secs|seconds|utc|epoch|date|datetime|zeit)(_|$)")
+
+_SIDES = {
+    "left": "left|l",
+    "right": "right|r",
+    "front_left": "front_left|fl|left_front|lf",
+    "front_right": "front_right|fr|right_front|rf",
+    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
+    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
+}
+_SPEED, _ROTATION = "v|vel|velocity|speed|wheel|wheel_speed|wheel_vel|wheel_velocity", "w|omega|rpm"
+_TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
+
+
+def _beside(word: str, side: str) -> str:
+    """Pattern of a name that holds a word and a side in either order, with or without "wheel"."""
+    return rf"(?:{word})_?(?:{side})|(?:wheel_)?(?:{side})_?(?:wheel_)?(?:{word})"
+
+
+_PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    (r"lat(?:itude)?", "gnss", ("latitude_deg",)),
+    (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
+    (r"alt|altitude|height|h", "gnss", ("height_m",)),
+    *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
+    *(
+        (rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel)_?{a}", "imu", (f"gyro_{a}_radps",))
+        for a in "xyz"
+    ),
+    (r"yaw_?rate|gyro_yaw|yaw_dot|gyro", "imu", ("gyro_z_radps",)),
+    *(
+        (rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc)_?{a}", "imu", (f"accel_{a}_mps2",))
+        for a in "xyz"
+    ),
+    *((_beside(_SPEED, s), "wheels", (f"{side}_mps", f"{side}_radps")) for side, s in _SIDES.items()),
+    *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
+    *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
+    (r"v|vel|velocity|speed|wheel_speed", "wheels", ("speed_mps",)),
+    *(
+        (_beside("i|cur|current|motor_current", _SIDES[side]), "motor", (f"{side}_a",))
+        for side in ("left", "right")
+    ),
+    *((rf"(?:pos|position|truth)?_?{a}", "truth", (f"{a}_m",)) for a in "xyz"),
+    (r"yaw|heading", "truth", ("yaw_rad",)),
+)
+"""Names of columns that people often use, the channel, and its fields that they may stand for."""
+_TOGETHER = (
+    ("gnss", ("latitude_deg", "longitude_deg")),
+    ("gnss", ("east_m", "north_m")),
+    ("motor", ("left_a", "right_a")),
+    ("truth", ("x_m", "y_m")),
+)
+_WHEELS = tuple(
+    tuple(f"{side}_{unit}" for side in sides)
+    for unit in ("radps", "mps", "rad")
+    for sides in (tuple(_SIDES)[2:], tuple(_SIDES)[:2])
+)
+
+
+@dataclass(frozen=True)
+class _Header:
+    """A column's name, without its unit, in small letters with underscores; and the unit, "" for none."""
+
+    column: str
+    base: str
+    unit: str
+
+
+def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
+    """A first column map for these columns, on one line, for the user to correct.
+
+    Args:
+        first: cells of the first row, which tell a time's unit where its name does not.
+    """
+    headers = [_header(name) for name in names]
+    time = next((h for h in headers if _TIME.search(h.base)), headers[0])
+    channels: dict[str, dict[str, str]] = {}
+    for header in headers:
+        guess = None if header is time else _guess(header)
+        if guess is not None and guess[1] not in channels.get(guess[0], {}):
+            channels.setdefault(guess[0], {})[guess[1]] = _entry(header, guess[1])
+    channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
+    cell = dict(zip(names, first, strict=False)).get(time.column, "")
+    sections = ", ".join(
+        f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
+        for channel, fields in channels.items()
+    )
+    return f"time: {_time_entry(time, cell)}, channels: {{{sections}}}"
+
+
+def _header(name: str) -> _Header:
+    bracketed = _BRACKETS.match(name)
+    base, unit = (bracketed[1], bracketed[2]) if bracketed else (name, "")
+    base = re.sub(r"([a-z])([A-Z])", r"\1_\2", base.strip())
+    base = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
+    known = UNIT_OF.get(re.sub(r"\s+", "", unit.strip().lower()), UNIT_OF.get(unit.strip().lower(), ""))
+    if not bracketed:
+        words = base.split("_")
+        for count in (3, 2, 1):  # deg_per_s, m_s, ms
+            ending = "_".join(words[-count:])
+            if count < len(words) and ending in UNIT_OF:
+                base, known = "_".join(words[:-count]), UNIT_OF[ending]
+                break
+    if known == "ticks" and not bracketed:
+        base = f"{base}_ticks"
+    return _Header(name, re.sub(r"^(imu|gps|gnss|odom|robot)_(?=.)", "", base), known)
+
+
+def _guess(header: _Header) -> tuple[str, str] | None:
+    """Channel and field that a column may stand for."""
+    for channel, fields in FIELDS.items():
+        own = header.column in fields and header.column not in TEXT_FIELDS  # whose codes no name tells
+        if own and channel in ("imu", "wheels", "gnss", "motor"):
+            return channel, header.column
+    for pattern, channel, fields in _PATTERNS:
+        if not re.fullmatch(pattern, header.base):
+            continue
+        for field in fields:
+            fits = not header.unit or header.unit in units_of(field)
+            if fits or (header.unit == "ticks" and field.endswith("_rad")):
+                return channel, field
+    return None
+
+
+def _entry(header: _Header, field: str) -> str:
+    name = json.dumps(header.column, ensure_ascii=False)
+    if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
+        return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
+    own = next(iter(units_of(field)))
+    if header.column == field or header.unit in ("", own):
+        return name
+    return f"{{column: {name}, unit: {header.unit}}}"
+
+
+def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """The channels without fields that cannot stand alone, and of wheels the best layout only."""
+    found = {channel: dict(fields) for channel, fields in channels.items()}
+    for channel, pair in _TOGETHER:
+        fields = found.get(channel, {})
+        if len(set(pair) & set(fields)) == 1:
+            fields.pop(pair[0], None)
+            fields.pop(pair[1], None)
+    for channel, needed in (("gnss", ("latitude_deg", "east_m")), ("truth", ("x_m",))):
+        if not set(needed) & set(found.get(channel, {})):
+            found.pop(channel, None)
+    gnss, wheels = found.get("gnss", {}), found.get("wheels", {})
+    if "latitude_deg" in gnss:
+        found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
+    layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
+    one = {"speed_mps": wheels["speed_mps"]} if "speed_mps" in wheels else {}
+    found["wheels"] = {name: wheels[name] for name in layout} or one
+    return {channel: fields for channel, fields in found.items() if fields}
+
+
+def _time_entry(time: _Header, cell: str) -> str:
+    name = json.dumps(time.column, ensure_ascii=False)
+    unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
+    try:
+        value = abs(float(cell.replace(",", ".")))
+    except ValueError:
+        if cell.strip():
+            return f"{{column: {name}, unit: iso8601}}"
+        return f"{{column: {name}, unit: {unit or 's'}, epoch: unix}}"
+    size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
+    unit = unit or next((known for known in ("ns", "us", "ms") if value >= size[known]), "s")
+    if value < 0.1 * size[unit]:
+        epoch = "none"
+    return f"{{column: {name}, unit: {unit}, epoch: {epoch}}}"
