@@ -169,9 +169,11 @@ def _messages(recording: Recording, answers: Answers) -> Draft:
 
 
 def _with_geometry(rig: Rig, answers: Answers) -> Rig:
-    radius, track = answers.wheel_radius_m, answers.track_m
+    radius, track, antenna = answers.wheel_radius_m, answers.track_m, answers.antenna_m
+    known = rig.known if antenna is None else dataclasses.replace(rig.known, antenna_m=antenna)
     return dataclasses.replace(
         rig,
+        known=known,
         wheel_radius_m=rig.wheel_radius_m if radius is None else radius.number,
         track_m=rig.track_m if track is None else track.number,
     )

@@ -158,7 +158,7 @@ class LiveNode:
         self.counts["received"] += 1
         try:
             if (topic, msgtype) == STATIC:
-                self._frames.add(message)
+                self._frames.add(message.stream(()))
             elif (topic, msgtype) == CLOCK:
                 stream = message.stream(())
                 seconds, rest = stream.column("clock.sec"), stream.column("clock.nanosec")

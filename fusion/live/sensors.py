@@ -21,7 +21,7 @@ from terrafusion.datasets.readers.ros.arriving import (
 )
 from terrafusion.datasets.readers.ros.bag import chosen_topics, recording_of
 from terrafusion.datasets.readers.ros.raw import BagError
-from terrafusion.datasets.readers.ros.static_frames import StaticFrames
+from terrafusion.datasets.readers.ros.static_frames import StaticFrames, mounting_note, with_mountings
 from terrafusion.datasets.readers.ros.topics import BagTopic
 
 NEEDED = ("imu", "wheels")
@@ -77,7 +77,7 @@ def find_sensors(
         found = frames.mounting(base, frame)
         if found is not None:
             mounted[kind] = found
-            notes.append(f"{kind}: {frame} is at {np.round(found[0], 3).tolist()} m, by /tf_static")
+            notes.append(mounting_note(kind, frame, found))
     turn = mounted["imu"][1] if "imu" in mounted else None
     if turn is not None:
         request = _without_axes(request)
@@ -89,11 +89,7 @@ def find_sensors(
         recording = recording_of(_usable(gathered, ArrivingMessages(request, dict(chosen))), repairing)
         if recording.imu is None or recording.wheels is None:
             raise
-    overrides = recording.overrides
-    if "imu" in mounted:
-        overrides = dataclasses.replace(overrides, imu_m=mounted["imu"][0])
-    if "gnss" in mounted:
-        overrides = dataclasses.replace(overrides, antenna_m=mounted["gnss"][0])
+    overrides = with_mountings(recording.overrides, mounted, request.rig)
     recording = dataclasses.replace(recording, overrides=overrides)
     arriving = ArrivingMessages(request, chosen, datum or recording.datum, _if_turned(turn))
     notes = [*(f"{kind}: {topic.name} ({topic.msgtype})" for kind, topic in chosen.items()), *notes]

@@ -19,6 +19,14 @@ from terrafusion.datasets.readers.ros.exact import META, restore
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.messages import Stream, twists, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
+from terrafusion.datasets.readers.ros.static_frames import (
+    STATIC,
+    Mounting,
+    StaticFrames,
+    antenna_is_known,
+    mounting_note,
+    with_mountings,
+)
 from terrafusion.datasets.readers.ros.streams import Key, broken_bag_on_error, read_streams
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
 from terrafusion.datasets.readers.ros.topics import (
@@ -118,7 +126,9 @@ def _recording(container: BagContainer, request: Request) -> Recording:
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
     start_ns = min(int(t[0]) for t in timing.times.values())
     joints = joints_given(request.topics)
-    builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
+    notes += timing.notes
+    frames = StaticFrames() if request.sha256 else _static_frames(container, notes)
+    builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, notes, frames=frames)
     return _build(builder, timing, datum)
 
 
@@ -137,6 +147,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
     if gnss is not None and "gnss_velocity" in streams:
         gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], timing.times["gnss_velocity"])
     others = {kind: built(kind) for kind in ("barometer", "magnetometer")}
+    mounted = _mounted(builder, streams)
     truth, frame = built("truth") or (None, "base")
     others |= {kind: built(kind) for kind in ("command", "terrain", "steering")}
     return Recording(
@@ -150,12 +161,36 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         datum=datum,
         truth_channels=truth_contents(truth) if truth is not None else (),
         truth_frame=frame,
-        overrides=Overrides(track_m=track),
+        overrides=with_mountings(Overrides(track_m=track), mounted, builder.rig),
         source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),
         notes=tuple(builder.notes),
         clock_jumps=timing.jumps,
         imu_frame_id=_usual_frame(streams["imu"]) if imu is not None else "",
     )
+
+
+def _static_frames(container: BagContainer, notes: list[str]) -> StaticFrames:
+    """Where the sensors of a robot are, as far as the bag tells; the catalogue knows its own bags."""
+    frames = StaticFrames()
+    if any((source.topic, source.msgtype) == STATIC and source.count for source in container.sources):
+        try:
+            frames.add(read_streams(container, {STATIC: ()})[STATIC])
+        except BagError as error:
+            notes.append(f"{STATIC[0]} is not used: {str(error)[:MOST_TEXT]}")
+    return frames
+
+
+def _mounted(builder: ChannelBuilder, streams: Mapping[str, Stream]) -> dict[str, Mounting]:
+    """The mounting of IMU and antenna, where the bag's fixed transforms lead from the body to them."""
+    mounted = {}
+    for kind in ("imu", "gnss"):
+        frame = _usual_frame(streams[kind]) if kind in streams else ""
+        found = builder.mounting(frame)
+        if found is not None:
+            mounted[kind] = found
+            if kind == "gnss" and not antenna_is_known(builder.rig):
+                builder.notes.append(mounting_note(kind, frame, found))
+    return mounted
 
 
 def _usual_frame(stream: Stream) -> str:

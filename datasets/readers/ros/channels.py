@@ -32,6 +32,13 @@ from terrafusion.datasets.readers.ros.joints import (
     wheel_joints,
 )
 from terrafusion.datasets.readers.ros.messages import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.readers.ros.static_frames import (
+    BASE,
+    Mounting,
+    StaticFrames,
+    mounting_note,
+    turned_by,
+)
 from terrafusion.datasets.readers.text.fixes import Fixes, located, with_assumed_sigma
 
 Datum = tuple[float, float, float]
@@ -48,7 +55,7 @@ class ChannelBuilder:
 
     `known` are the conventions of a catalogued bag: its track makes the side speeds where there is
     no rig, and its IMU's axes are left to whoever applies the conventions. A bag of this library is read
-    `as_written`, to the bit.
+    `as_written`, to the bit. `frames` turn sensors whose mounting they tell.
     """
 
     file: Path
@@ -58,6 +65,7 @@ class ChannelBuilder:
     joints: dict[str, str]
     notes: list[str] = field(default_factory=list)
     as_written: bool = False
+    frames: StaticFrames = field(default_factory=StaticFrames)
 
     def command(self, stream: Stream, t_ns: TimesNs) -> Command:
         """Commanded twists."""
@@ -91,6 +99,10 @@ class ChannelBuilder:
             return None
         return Magnetometer(t_ns[held], self._to_body("magnetometer", stream, field)[0][held])
 
+    def mounting(self, frame: str) -> Mounting | None:
+        """Where a sensor with a frame of its own is, and how it is turned, by the bag's fixed frames."""
+        return None if frame in ("", BASE) else self.frames.mounting(BASE, frame)
+
     def _held(self, name: str, topic: str, held: Mask) -> Mask:
         if not held.all():
             lost = int((~held).sum())
@@ -100,6 +112,11 @@ class ChannelBuilder:
     def _to_body(self, name: str, stream: Stream, *vectors: Array) -> tuple[Array, ...]:
         frames = sorted(set(stream.frame_ids.tolist()))
         names = ", ".join(f"'{frame}'" for frame in frames)
+        mounting = self.mounting(frames[0]) if len(frames) == 1 else None
+        if mounting is not None:
+            self.notes.append(mounting_note(name, frames[0], mounting))
+            R = mounting[1]
+            return vectors if np.array_equal(R, np.eye(3)) else tuple(turned_by(R, v) for v in vectors)
         if self.rig is None:
             if self.known.imu_axes == BODY_AXES:
                 self.notes.append(

@@ -11,6 +11,7 @@ from terrafusion.datasets.readers.open import find_log
 from terrafusion.datasets.readers.ros import ros1, ros2
 from terrafusion.datasets.readers.ros.bag import chosen_topics, opened_bag, topics_of
 from terrafusion.datasets.readers.ros.messages import wanted_fields
+from terrafusion.datasets.readers.ros.static_frames import STATIC
 from terrafusion.datasets.readers.ros.streams import read_streams
 from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
@@ -75,5 +76,6 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         t_ns = stream.receipt_ns if stream.header_ns is None else stream.header_ns
         if len(t_ns):  # the index of a bag may count messages that are not there
             contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
-    unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in there if topic not in usable)
+    others = [topic for topic in there if topic not in usable and topic.name != STATIC[0]]
+    unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in others)
     return BagContents(tuple(contents), unused, candidates)

@@ -1,11 +1,21 @@
 """Fixed transforms of a robot (`/tf_static`): where its sensors are, and how they are turned."""
 
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import quaternion_to_matrix
-from terrafusion.datasets.readers.ros.arriving import RawMessage
+from terrafusion.datasets.core.recording import Overrides
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.readers.ros.messages import Stream
 
+BASE = "base_link"
+"""Frame of the body in a bag, by REP-105."""
+Mounting = tuple[tuple[float, float, float], Array]
+"""Position (m) of a sensor in the axes of the body, and rotation (3, 3) from its axes to those."""
 STATIC = ("/tf_static", "tf2_msgs/msg/TFMessage")
 RIGHT_ANGLE = 0.01
 """A rotation this near to one by right angles is taken for it (0.6 degrees)."""
@@ -17,26 +27,26 @@ class StaticFrames:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Array, Array]] = {}
 
-    def add(self, message: RawMessage) -> None:
-        """Take the transforms of a tf2_msgs/TFMessage.
+    def add(self, stream: Stream) -> None:
+        """Take the transforms of messages tf2_msgs/TFMessage."""
+        for block in stream.blocks:
+            for row in range(len(block.rows)):
+                self._add({path: column[row] for path, column in block.columns.items()})
 
-        Raises:
-            BagError: it does not fit its definition.
-        """
-        columns = message.stream(()).blocks[0].columns
+    def _add(self, message: dict[str, Any]) -> None:
         i = 0
-        while (at := f"transforms.{i}.child_frame_id") in columns:
+        while (at := f"transforms.{i}.child_frame_id") in message:
             start = f"transforms.{i}.transform"
-            translation = np.array([columns[f"{start}.translation.{axis}"][0] for axis in "xyz"])
-            quaternion = np.array([columns[f"{start}.rotation.{axis}"][0] for axis in "xyzw"])
+            translation = np.array([message[f"{start}.translation.{axis}"] for axis in "xyz"])
+            quaternion = np.array([message[f"{start}.rotation.{axis}"] for axis in "xyzw"])
             length = np.linalg.norm(quaternion)
             if np.isfinite(translation).all() and 0.9 < length < 1.1:
-                parent = str(columns[f"transforms.{i}.header.frame_id"][0])
+                parent = str(message[f"transforms.{i}.header.frame_id"])
                 R = quaternion_to_matrix(quaternion / length)
-                self._parents[_plain(str(columns[at][0]))] = (_plain(parent), translation, R)
+                self._parents[_plain(str(message[at]))] = (_plain(parent), translation, R)
             i += 1
 
-    def mounting(self, base: str, frame: str) -> tuple[tuple[float, float, float], Array] | None:
+    def mounting(self, base: str, frame: str) -> Mounting | None:
         """Position (m) of a frame in the base's axes, and rotation (3, 3) from its axes to the base's.
 
         None where no chain of transforms leads from one to the other.
@@ -53,6 +63,36 @@ class StaticFrames:
             frame, translation, turn = self._parents[frame]
             position, R = translation + turn @ position, turn @ R
         return None
+
+
+def mounting_note(kind: str, frame: str, mounting: Mounting) -> str:
+    """What `/tf_static` says of a sensor."""
+    position, R = mounting
+    turned = "" if np.array_equal(R, np.eye(3)) else " and turned"
+    return f"{kind}: {frame} is at {np.round(position, 3).tolist()} m{turned}, by /tf_static"
+
+
+def with_mountings(overrides: Overrides, mounted: Mapping[str, Mounting], rig: Rig | None) -> Overrides:
+    """The geometry with the positions of IMU and antenna, unless the vehicle file has measured the latter."""
+    if "imu" in mounted:
+        overrides = dataclasses.replace(overrides, imu_m=mounted["imu"][0])
+    if "gnss" in mounted and not antenna_is_known(rig):
+        overrides = dataclasses.replace(overrides, antenna_m=mounted["gnss"][0])
+    return overrides
+
+
+def antenna_is_known(rig: Rig | None) -> bool:
+    """Whether the vehicle file has measured or calibrated the place of the antenna."""
+    antenna = rig.known.antenna_m if rig is not None else None
+    return antenna is not None and antenna.known in ("measured", "calibrated")
+
+
+def turned_by(R: Array, values: Array) -> Array:
+    """R @ v of vectors (N, 3); an axis is NaN only where it depends on one that is."""
+    missing = np.isnan(values)
+    out = np.where(missing, 0.0, values) @ R.T
+    out[missing.astype(float) @ (np.abs(R) > 0.0).T > 0.0] = np.nan
+    return np.asarray(out)
 
 
 def _plain(frame: str) -> str:

@@ -10,7 +10,9 @@ from typer.testing import CliRunner
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.ros.static_frames import turned_by
 from terrafusion.fusion.cli.main import app
+from terrafusion.twin.model.vehicle import load_vehicle
 from tests.datasets.ros_bags import MAKE2, T0, Message, imu_messages, write_ros2
 
 JOINTS = "sensor_msgs/msg/JointState"
@@ -108,3 +110,69 @@ def test_inspect_and_init_say_what_a_bag_lacks(tmp_path: Path) -> None:
         assert done.exit_code == 1
         assert "no wheel speeds; " in str(done.exception)
         assert "--topic joint.left=NAME" in str(done.exception)
+
+
+TF = "tf2_msgs/msg/TFMessage"
+HALF = float(np.sqrt(0.5))
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def transform(parent: str, child: str, at: tuple[float, float, float], q: tuple[float, ...] = LEVEL) -> Any:
+    turn = MAKE2.new("geometry_msgs/msg/Quaternion", *q)
+    place = MAKE2.new("geometry_msgs/msg/Transform", MAKE2.vector(*at), turn)
+    return MAKE2.new("geometry_msgs/msg/TransformStamped", MAKE2.header(T0, parent), child, place)
+
+
+def mounted_bag(path: Path, base: str = "base_link") -> Path:
+    """An IMU turned to the left on a plate of the robot, an antenna, and where they are, in two messages."""
+    plate = transform(base, "plate", (0.0, 0.0, 0.2))
+    imu_box = transform("plate", "imu_box", (0.1, 0.0, 0.05), (0.0, 0.0, HALF, HALF))
+    both = [imu_box, transform(base, "gps", (-0.1, 0.0, 0.6))]
+    static = [("/tf_static", TF, T0 + k, MAKE2.new(TF, one)) for k, one in enumerate(([plate], both))]
+    imu = imu_messages(MAKE2, frame="imu_box", gyro=(0.3, 0.2, 0.5), accel=(1.0, 2.0, 9.81))
+    fixes = [("/fix", "sensor_msgs/msg/NavSatFix", T0 + k, MAKE2.fix(T0 + k, 48.0, 11.0)) for k in range(3)]
+    return write_ros2(path, sorted([*static, *imu, *fixes], key=lambda one: one[2]))
+
+
+def test_fixed_frames_of_a_bag_turn_its_imu_and_place_its_sensors(tmp_path: Path) -> None:
+    recording = open_recording(mounted_bag(tmp_path / "bag"))
+    assert recording.imu is not None
+    np.testing.assert_allclose(recording.imu.accel_mps2[0], (-2.0, 1.0, 9.81))  # its x is the robot's left
+    np.testing.assert_allclose(recording.imu.gyro_radps[0], (-0.2, 0.3, 0.5))
+    assert recording.overrides.imu_m == pytest.approx((0.1, 0.0, 0.25))
+    assert recording.overrides.antenna_m == pytest.approx((-0.1, 0.0, 0.6))
+    assert "imu: imu_box is at [0.1, 0.0, 0.25] m and turned, by /tf_static" in recording.notes
+    assert "gnss: gps is at [-0.1, 0.0, 0.6] m, by /tf_static" in recording.notes
+
+
+def test_frames_go_before_the_axes_of_a_vehicle_but_not_before_a_measured_antenna(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(
+        """robot:
+  imu_axes: ["-z", "-x", "+y"]
+  imu_frame: imu_box
+  antenna_m: {value: [0.0, 0.0, 0.9], known: measured}
+"""
+    )
+    recording = open_recording(mounted_bag(tmp_path / "bag"), rig=load_vehicle(file).rig())
+    assert recording.imu is not None
+    np.testing.assert_allclose(recording.imu.accel_mps2[0], (-2.0, 1.0, 9.81))
+    assert recording.overrides.antenna_m is None
+    assert recording.overrides.imu_m == pytest.approx((0.1, 0.0, 0.25))
+
+
+def test_without_the_base_frame_nothing_changes(tmp_path: Path) -> None:
+    recording = open_recording(mounted_bag(tmp_path / "bag", base="chassis"))
+    assert recording.imu is not None
+    assert recording.imu.accel_mps2[0].tolist() == [1.0, 2.0, 9.81]
+    assert (recording.overrides.imu_m, recording.overrides.antenna_m) == (None, None)
+    assert not any("/tf_static" in note for note in recording.notes)
+
+
+def test_a_turn_of_any_angle_keeps_missing_axes_missing() -> None:
+    c, s = np.cos(0.3), np.sin(0.3)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    assert turned_by(R, np.array([[1.0, 0.0, 2.0]]))[0] == pytest.approx(R @ (1.0, 0.0, 2.0))
+    lone = turned_by(R, np.array([[np.nan, np.nan, 2.0]]))[0]
+    assert np.isnan(lone[:2]).all()
+    assert lone[2] == 2.0
