@@ -71,3 +71,24 @@ def speeds_of(t_ns: TimesNs, angle_rad: Array) -> tuple[Mask, Array]:
     later = dt_s > 0.0
     speed = np.diff(angle_rad, axis=0)[later] / dt_s[later, None]
     return np.concatenate([[False], later]), speed
+
+
+class TurnCounter:
+    """Unwraps angles that come one after another, as `unwrapped` does of a log where steps are small."""
+
+    def __init__(self) -> None:
+        self._last: Array | None = None
+        self._least = self._most = self._turns = np.zeros(0)
+
+    def counted(self, angle_rad: Array) -> Array:
+        """The angles (wheels,) with the whole turns since the first; the same array where there are none."""
+        if self._last is None or self._last.shape != angle_rad.shape or not np.isfinite(angle_rad).all():
+            self._last = self._least = self._most = angle_rad
+            self._turns = np.zeros_like(angle_rad)
+            return angle_rad
+        self._least = np.minimum(self._least, angle_rad)
+        self._most = np.maximum(self._most, angle_rad)
+        step, self._last = angle_rad - self._last, angle_rad
+        jumps = (np.abs(step) > NEARLY * TURN_RAD) & (self._most - self._least <= WITHIN * TURN_RAD)
+        self._turns = self._turns + np.where(jumps, np.rint(step / TURN_RAD), 0.0)
+        return angle_rad - TURN_RAD * self._turns if self._turns.any() else angle_rad

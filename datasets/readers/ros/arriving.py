@@ -4,6 +4,7 @@ Both ways go through the decoder and the `ChannelBuilder` of bags: a message giv
 from a bag.
 """
 
+import dataclasses
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import errors_of
-from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.messages import Message, WheelSample
+from terrafusion.datasets.core.wrapped_angles import TurnCounter
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder, Datum
@@ -23,6 +25,7 @@ from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch
+from terrafusion.datasets.readers.ros.static_frames import turned_by
 from terrafusion.datasets.readers.ros.streams import broken_bag_on_error, types_of
 from terrafusion.datasets.readers.ros.topics import joints_given
 
@@ -134,6 +137,7 @@ class ArrivingMessages:
     _decoders: dict[str, MessageDecoder] = field(default_factory=dict)
     _velocities: deque[tuple[int, Stream]] = field(default_factory=lambda: deque(maxlen=50))
     _before: RawMessage | None = None
+    _turns: TurnCounter = field(default_factory=TurnCounter)
     _header_ns: int = 0
 
     def samples(self, message: RawMessage) -> list[tuple[int, str, Any]]:
@@ -192,8 +196,8 @@ class ArrivingMessages:
             channel = getattr(builder, kind)(stream, t_ns)
             for sample in () if channel is None else channel.samples():
                 if kind == "imu" and self.imu_turn is not None:
-                    R = self.imu_turn
-                    sample = type(sample)(sample.t_ns, R @ sample.gyro_radps, R @ sample.accel_mps2)
+                    both = np.stack([sample.gyro_radps, sample.accel_mps2])
+                    sample = type(sample)(sample.t_ns, *turned_by(self.imu_turn, both))
                 yield sample
 
     def _wheels(self, stream: Stream, t_ns: NDArray[np.int64], message: RawMessage) -> Iterator[Message]:
@@ -210,8 +214,14 @@ class ArrivingMessages:
                 stream = self._stream("wheels", before, message)
                 t_ns = np.concatenate([self._time_of(stream.select(np.array([i]))) for i in range(2)])
             wheels, _ = self._builder().wheels(stream, t_ns, None)
-        if wheels is not None:
-            yield from list(wheels.samples())[-1:]
+        for sample in [] if wheels is None else list(wheels.samples())[-1:]:
+            assert isinstance(sample, WheelSample)
+            angle = sample.angle_rad
+            if angle is not None and len(stream) > 1:  # as it came: its turns are counted below
+                builder = dataclasses.replace(self._builder(), as_written=True)
+                raw, _ = builder.wheels(stream, t_ns, None)
+                angle = None if raw is None or raw.angle_rad is None else raw.angle_rad[-1]
+            yield sample if angle is None else sample._replace(angle_rad=self._turns.counted(angle))
 
     def _is_nowhere(self, stream: Stream) -> bool:
         """Latitude and longitude 0, which receivers report that know none, unless the datum is there."""

@@ -88,9 +88,10 @@ def antenna_is_known(rig: Rig | None) -> bool:
 
 
 def turned_by(R: Array, values: Array) -> Array:
-    """R @ v of vectors (N, 3); an axis is NaN only where it depends on one that is."""
+    """R @ v of vectors (N, 3), with the same bits for any N; an axis is NaN only where it depends on one."""
     missing = np.isnan(values)
-    out = np.where(missing, 0.0, values) @ R.T
+    known = np.where(missing, 0.0, values)
+    out = sum((known[:, i, None] * R[:, i] for i in range(3)), np.zeros_like(known))
     out[missing.astype(float) @ (np.abs(R) > 0.0).T > 0.0] = np.nan
     return np.asarray(out)
 

@@ -9,6 +9,7 @@ from hypothesis.extra import numpy as hnp
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.wrapped_angles import (
     TURN_RAD,
+    TurnCounter,
     unwrapped,
     unwrapped_alone,
     unwrapped_beside_speeds,
@@ -38,6 +39,19 @@ def test_angles_beyond_one_turn_are_returned_as_they_are(angle: np.ndarray) -> N
 def test_a_slow_log_of_less_than_a_turn_keeps_its_bits() -> None:
     angle = np.array([[0.0], [0.0], [2.5], [2.5], [5.0], [5.1]])
     assert unwrapped(angle, ("left",)) == (angle, "")
+
+
+@given(STEPS)
+def test_angles_that_arrive_one_by_one_are_counted_as_in_a_log(steps: np.ndarray) -> None:
+    true = np.concatenate([[0.0], np.cumsum(steps)])
+    wrapped = np.stack([true % TURN_RAD, true], axis=1)
+    whole, _ = unwrapped(wrapped, ("left", "right"))
+    assert whole is not None
+    counter = TurnCounter()
+    arrived = np.array([counter.counted(row) for row in wrapped])
+    np.testing.assert_array_equal(arrived[:, 0], whole[:, 0])
+    if np.ptp(true) > 1.001 * TURN_RAD:
+        np.testing.assert_array_equal(arrived[:, 1], true)
 
 
 def test_missing_cells_stay_missing_and_the_other_wheel_keeps_its_bits() -> None:
