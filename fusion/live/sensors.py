@@ -21,7 +21,12 @@ from terrafusion.datasets.readers.ros.arriving import (
 )
 from terrafusion.datasets.readers.ros.bag import chosen_topics, recording_of
 from terrafusion.datasets.readers.ros.raw import BagError
-from terrafusion.datasets.readers.ros.static_frames import StaticFrames, mounting_note, with_mountings
+from terrafusion.datasets.readers.ros.static_frames import (
+    StaticFrames,
+    mounting_note,
+    tells_turn,
+    with_mountings,
+)
 from terrafusion.datasets.readers.ros.topics import BagTopic
 
 NEEDED = ("imu", "wheels")
@@ -78,9 +83,9 @@ def find_sensors(
         if found is not None:
             mounted[kind] = found
             notes.append(mounting_note(kind, frame, found))
-    turn = mounted["imu"][1] if "imu" in mounted else None
-    if turn is not None:
-        request = _without_axes(request)
+    turn = None
+    if "imu" in mounted and tells_turn(mounted["imu"], _frame(gathered, chosen["imu"]), request.rig):
+        turn, request = mounted["imu"][1], _without_axes(request)
     # Stamps out of order are no reason to wait: only the kinds of sensors are taken from this recording.
     repairing = dataclasses.replace(request, repair_clock=True)
     try:

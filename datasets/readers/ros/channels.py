@@ -37,6 +37,7 @@ from terrafusion.datasets.readers.ros.static_frames import (
     Mounting,
     StaticFrames,
     mounting_note,
+    tells_turn,
     turned_by,
 )
 from terrafusion.datasets.readers.text.fixes import Fixes, located, with_assumed_sigma
@@ -113,7 +114,7 @@ class ChannelBuilder:
         frames = sorted(set(stream.frame_ids.tolist()))
         names = ", ".join(f"'{frame}'" for frame in frames)
         mounting = self.mounting(frames[0]) if len(frames) == 1 else None
-        if mounting is not None:
+        if mounting is not None and tells_turn(mounting, frames[0], self.rig):
             self.notes.append(mounting_note(name, frames[0], mounting))
             R = mounting[1]
             return vectors if np.array_equal(R, np.eye(3)) else tuple(turned_by(R, v) for v in vectors)

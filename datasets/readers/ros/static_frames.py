@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.conventions import BODY_AXES
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.sensors import Rig
@@ -63,6 +64,15 @@ class StaticFrames:
             frame, translation, turn = self._parents[frame]
             position, R = translation + turn @ position, turn @ R
         return None
+
+
+def tells_turn(mounting: Mounting, frame: str, rig: Rig | None) -> bool:
+    """Whether the transforms tell how a sensor is turned. Without a turn they may just not have been told:
+    then axes that the vehicle file has for this frame hold."""
+    if not np.array_equal(mounting[1], np.eye(3)) or rig is None:
+        return True
+    imu = rig.sensors.imu
+    return _plain(imu.frame_id) != _plain(frame) or tuple(imu.axes) == BODY_AXES
 
 
 def mounting_note(kind: str, frame: str, mounting: Mounting) -> str:

@@ -123,10 +123,12 @@ def transform(parent: str, child: str, at: tuple[float, float, float], q: tuple[
     return MAKE2.new("geometry_msgs/msg/TransformStamped", MAKE2.header(T0, parent), child, place)
 
 
-def mounted_bag(path: Path, base: str = "base_link") -> Path:
+def mounted_bag(
+    path: Path, base: str = "base_link", turn: tuple[float, ...] = (0.0, 0.0, HALF, HALF)
+) -> Path:
     """An IMU turned to the left on a plate of the robot, an antenna, and where they are, in two messages."""
     plate = transform(base, "plate", (0.0, 0.0, 0.2))
-    imu_box = transform("plate", "imu_box", (0.1, 0.0, 0.05), (0.0, 0.0, HALF, HALF))
+    imu_box = transform("plate", "imu_box", (0.1, 0.0, 0.05), turn)
     both = [imu_box, transform(base, "gps", (-0.1, 0.0, 0.6))]
     static = [("/tf_static", TF, T0 + k, MAKE2.new(TF, one)) for k, one in enumerate(([plate], both))]
     imu = imu_messages(MAKE2, frame="imu_box", gyro=(0.3, 0.2, 0.5), accel=(1.0, 2.0, 9.81))
@@ -159,6 +161,17 @@ def test_frames_go_before_the_axes_of_a_vehicle_but_not_before_a_measured_antenn
     np.testing.assert_allclose(recording.imu.accel_mps2[0], (-2.0, 1.0, 9.81))
     assert recording.overrides.antenna_m is None
     assert recording.overrides.imu_m == pytest.approx((0.1, 0.0, 0.25))
+
+
+def test_a_frame_without_a_turn_leaves_the_axes_of_the_vehicle_in_force(tmp_path: Path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text('robot:\n  imu_axes: ["-x", "-y", "+z"]\n  imu_frame: imu_box\n')
+    bag = mounted_bag(tmp_path / "bag", turn=LEVEL)
+    for rig, accel in ((None, (1.0, 2.0, 9.81)), (load_vehicle(file).rig(), (-1.0, -2.0, 9.81))):
+        recording = open_recording(bag, rig=rig)
+        assert recording.imu is not None
+        np.testing.assert_allclose(recording.imu.accel_mps2[0], accel)
+        assert recording.overrides.imu_m == pytest.approx((0.1, 0.0, 0.25))
 
 
 def test_without_the_base_frame_nothing_changes(tmp_path: Path) -> None:
