@@ -1,0 +1,75 @@
+"""Tables as loggers write them: units in headers, ticks of encoders, decimal commas."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.readers import open_recording
+from tests.datasets.readers.test_table import GYRO_MAP, table
+
+HEADERS = {
+    "brackets": (
+        "timestamp [ms];wx [deg/s];wz [deg/s];ax [m/s^2];left ticks;right ticks;vl [m/s];vr [km/h];"
+        "Latitude [deg];Longitude [deg];Altitude [m];fix",
+        "1714564800000.5;0;90;1;5;6;2;7.2;48;11;500;4",
+    ),
+    "suffixes": (
+        "stamp_ns,gyro_z_deg_s,acc_z_g,v_left_kmh,v_right_kmh,lat,lon,alt_mm",
+        "1714564800000500000,90,1,7.2,7.2,48,11,500000",
+    ),
+    "milliseconds": (
+        "timestamp_ms,imu.gyro.z,speed,gps_lat,gps_lon",
+        "1714564800000.5,1.5707963267948966,2,48,11",
+    ),
+    "no unit of time": ("t,yaw_rate_dps,speed_mps,lat,lon", "1714564800000.5,90,2,48,11"),
+    "decimal commas": ("time;gz [deg/s];speed;lat;lon", "1714564800,0005;90,0;2,0;48,0;11,0"),
+}
+
+
+@pytest.mark.parametrize("case", HEADERS)
+def test_the_proposed_map_reads_units_in_headers(tmp_path: Path, case: str) -> None:
+    header, row = HEADERS[case]
+    path = table(tmp_path, f"{header}\n{row}\n", None)
+    with pytest.raises(DataError, match="this proposal, whose fields and units are guesses") as told:
+        open_recording(path)
+    (tmp_path / "drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    recording = open_recording(path)
+    assert recording.start_ns == 1_714_564_800_000_500_000
+    assert recording.imu is not None
+    assert recording.imu.gyro_radps[0, 2] == pytest.approx(np.pi / 2)
+    assert recording.wheels is not None
+    assert recording.wheels.speed[0].tolist() == pytest.approx([2.0] * len(recording.wheels.names))
+    assert recording.gnss is not None
+    if "acc_z" in header:
+        assert recording.imu.accel_mps2[0, 2] == 9.80665
+    assert any("decimal commas" in note for note in recording.notes) == (case == "decimal commas")
+
+
+def test_ticks_are_proposed_as_angles_with_a_scale(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f},{512 * k},{1024 * k}\n" for k in range(20))
+    path = table(tmp_path, f"t,left_ticks,right_ticks\n{rows}", None)
+    with pytest.raises(DataError, match="how many ticks make a turn") as told:
+        open_recording(path)
+    assert "gyro" not in str(told.value)
+    (tmp_path / "drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    recording = open_recording(path)
+    assert recording.wheels is not None
+    np.testing.assert_allclose(recording.wheels.speed, np.tile([10 * np.pi, 20 * np.pi], (19, 1)))
+    assert "wheels: no speeds are there; they are differences of the angles" in recording.notes
+
+
+@pytest.mark.parametrize(("scale", "factor"), [("1/1024", 1 / 1024), ("'-3/4'", -0.75), ("2.5", 2.5)])
+def test_a_scale_multiplies_a_column(tmp_path: Path, scale: str, factor: float) -> None:
+    columns = GYRO_MAP.replace("wz}", f"{{column: wz, unit: rev/s, scale: {scale}}}}}")
+    imu = open_recording(table(tmp_path, "t,wz\n0,8\n", columns)).imu
+    assert imu is not None
+    assert imu.gyro_radps[0, 2] == pytest.approx(16 * np.pi * factor)
+
+
+def test_a_comma_between_words_is_no_decimal_comma(tmp_path: Path) -> None:
+    columns = "time: {column: t}\nchannels: {imu: {gyro_z_radps: wz}, terrain: {label: ground}}\n"
+    recording = open_recording(table(tmp_path, "t;wz;ground\n0.5;1;mud, wet\n", columns))
+    assert recording.terrain is not None
+    assert recording.terrain.label[0] == "mud, wet"
