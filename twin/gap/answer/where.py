@@ -3,8 +3,8 @@ references.
 
 A cell's share is its part of the excess of squared errors. Its p-value holds for all cells together: the
 greatest standardised excess over all cells, among replicates of the judged drives (max-T, Westfall and Young
-1993). A replicate errs by what is unknown of the robot and by its scatter from run to run, as `detection` has
-them, and by noise whose mean square in each cell scatters as the references' does.
+1993). In a replicate the mean square of a cell scatters as the references' does. It is larger by what is
+unknown of the robot there, and by how much more its scatter from run to run shows than on their drives.
 """
 
 import math
@@ -22,12 +22,14 @@ from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.loud_noise import LOUD
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
-from terrafusion.twin.gap.rollout.residuals import physical_error
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 LEAST_SAMPLES = 5  # effective, of all runs together, from which a cell is listed (assumed)
 REPLICATES = 299  # of the judged drives
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
 LEAST_SPREAD = 0.05  # variance added to that of the references' log mean squares, in runs (assumed)
+SCATTER_RUNS, SCATTER_DRAWS = 3, 20  # references, and draws each, that show the squares due to scatter
+LEAST_NOISE = 0.25  # least share of the references' mean squares that is noise (assumed)
 UNSEEN = math.log(LOUD)
 """1 sigma of the log mean square in a regime that no reference drove: up to so much louder, no noise is taken
 to be louder."""
@@ -117,13 +119,28 @@ def _p_values(
 
     unseen = UNSEEN * (count[J:, kept].max(axis=0) < 1.0) * rng.standard_normal((REPLICATES, len(kept)))
     drawn = -spread() / np.sqrt(R)  # of the references' mean
-    offsets, scatter = drawn_robots(robot, REPLICATES, rng), drawn_scatter(robot, J, REPLICATES, rng)
-    for run, own, omega in zip(evidence.runs, cells[:J], scatter, strict=True):
-        moved = run.rows[:, run.states : -1] @ (offsets + omega).T.astype(np.float32)
-        more = own.squares(without_states(run, sigma, moved.astype(float)))[kept].T / (own.count[kept] + 1.0)
-        drawn += np.log(np.exp(normal + unseen + spread()) + more) / J
+
+    def scattered(runs: Sequence[WhitenedRun], of: Sequence[RunCells]) -> list[Array]:
+        draws = drawn_scatter(robot, len(runs), SCATTER_DRAWS, rng)
+        every = zip(runs, of, draws, strict=True)
+        return [_moved(run, own, d, sigma)[:, kept].mean(axis=0) for run, own, d in every]
+
+    some = slice(SCATTER_RUNS)
+    usual = np.mean(scattered(evidence.references[some], cells[J:][some]), axis=0)
+    noise = np.maximum(np.exp(normal) - usual, LEAST_NOISE * np.exp(normal))
+    offsets, scatter = drawn_robots(robot, REPLICATES, rng), scattered(evidence.runs, cells[:J])
+    for run, of, own in zip(evidence.runs, cells[:J], scatter, strict=True):
+        unknown = _moved(run, of, offsets, sigma)[:, kept]
+        larger = np.log((noise + own + unknown) / (noise + usual))
+        drawn += (normal + larger + unseen + spread()) / J
     excess, drawn = log[:J].mean(axis=0) - normal, drawn - normal
     middle, high = np.quantile(drawn, [0.5, 0.95], axis=0)
     least = (excess - middle) / (high - middle)
     tops = ((drawn - middle) / (high - middle)).max(axis=1)
     return np.array([(1.0 + np.count_nonzero(tops >= x)) / (1.0 + len(tops)) for x in least])
+
+
+def _moved(run: WhitenedRun, cells: RunCells, offsets: Array, sigma: Array) -> Array:
+    """Mean squares (N, cells) of what offsets (N, P) do to a run."""
+    moved = run.rows[:, run.states : -1] @ offsets.T.astype(np.float32)
+    return cells.squares(without_states(run, sigma, moved.astype(float))).T / (cells.count + 1.0)
