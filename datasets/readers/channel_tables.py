@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask, distinct
+from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -26,7 +27,6 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.csv_table import ChannelColumns, CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
-from terrafusion.datasets.readers.text.fixes import with_assumed_sigma
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -40,7 +41,7 @@ from terrafusion.datasets.readers.ros.static_frames import (
     tells_turn,
     turned_by,
 )
-from terrafusion.datasets.readers.text.fixes import Fixes, located, with_assumed_sigma
+from terrafusion.datasets.readers.text.fixes import Fixes, located
 
 Datum = tuple[float, float, float]
 

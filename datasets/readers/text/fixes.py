@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, Rig
 from terrafusion.datasets.readers.formats import Request
 
 Datum = tuple[float, float, float]
-
-UP_FACTOR = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,22 +105,3 @@ def located(
     enu = geodetic_to_enu(llh, datum)
     enu[flat, 2] = np.nan
     return held, enu, datum, notes
-
-
-def with_assumed_sigma(rig: Rig | None, sigma: Array, fix: NDArray[np.uint8]) -> tuple[Array, list[str]]:
-    """Sigmas (N, 3) with the unknown and the non-positive ones filled, and a note where any was."""
-    unknown = ~(sigma > 0.0)
-    if not unknown[:, :2].any():
-        sigma = np.where(unknown, np.nan, sigma)
-        return sigma, []
-    filled = int(unknown[:, :2].any(axis=1).sum())
-    spec = rig.sensors.gnss if rig else None
-    if spec is not None:
-        assumed = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
-        origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"
-    else:
-        flat = np.array([ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])[fix]
-        assumed = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
-        used = ", ".join(f"{Fix(k).name.lower()} {ASSUMED_SIGMA_M[Fix(k)]:g} m" for k in np.unique(fix))
-        origin = f"assumed by class, flat: {used}"
-    return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes have no sigma; taken from {origin}"]

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import TimesNs
+from terrafusion.datasets.core.assumed_sigma import UP_FACTOR
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, NmeaEpochs, collect
 from terrafusion.datasets.readers.text.row_times import row_times
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, distinct
+from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -29,7 +30,7 @@ from terrafusion.datasets.readers.text.column_map import (
     contract_map,
     read_column_map,
 )
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
