@@ -71,7 +71,7 @@ from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-OUTAGE_S, LONGEST_STEP_S = 2.0, 1.0
+LONGEST_STEP_S = 1.0
 SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
@@ -419,18 +419,13 @@ class Estimator:
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
         """Zero-velocity update where the robot has stood for a window."""
-        known = not self._is_outage(t_ns)
-        sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
+        unknown = self.gnss.is_outage(t_ns)
+        sigma = np.inf if unknown else float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace()))
         biases = before.bias.gyroscope(), before.bias.accelerometer()
         if self._stationarity.is_stationary(
             t_ns, self.imu, self.wheels, *biases, math.sqrt(before.velocity @ before.velocity), sigma
         ):
             add_zero_velocity(self.chain, k, link)
-
-    def _is_outage(self, t_ns: int) -> bool:
-        """Whether no fix has come for long; one that comes late is as old as its delay."""
-        used_ns = self.gnss.last_used_ns
-        return used_ns is None or (t_ns - used_ns) * 1e-9 > OUTAGE_S + max(self.gnss.delay_s, 0.0)
 
     def _emitted(self, t_ns: int, gyro: Array) -> State:
         key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
@@ -439,7 +434,7 @@ class Estimator:
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             terrain=self.weights.posterior(),
-            status="no_gnss" if self.gnss.local else ("outage" if self._is_outage(t_ns) else "running"),
+            status="no_gnss" if self.gnss.local else ("outage" if self.gnss.is_outage(t_ns) else "running"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._covariance, gyro, gyro_sigma),

@@ -37,6 +37,7 @@ UNKNOWN_HEIGHT_SIGMA_M = 1e6
 """1 sigma of an unknown height: even many such fixes must not determine it."""
 UNKNOWN_CLIMB_MPS = 100.0
 """1 sigma of the upward velocity of a receiver that reports speed and course alone."""
+OUTAGE_S = 2.0
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
@@ -158,6 +159,11 @@ class GnssUpdater:
         changed = len(self.waiting) != self._seen
         self._seen = len(self.waiting)
         return changed
+
+    def is_outage(self, t_ns: int) -> bool:
+        """Whether no fix has come for long; one that comes late is as old as its delay."""
+        used_ns = self.last_used_ns
+        return used_ns is None or (t_ns - used_ns) * 1e-9 > OUTAGE_S + max(self.delay_s, 0.0)
 
     def update(self, chain: Chain, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.

@@ -70,7 +70,7 @@ def test_studies_with_many_trials_take_workers() -> None:
         if study.spread and study.command[0] == "-m":
             file = Path(*study.command[1].split("."))
             text = (Path(__file__).parents[2] / file).with_suffix(".py").read_text(encoding="utf-8")
-            assert "add_options(parser)" in text or "parser_of(" in text
+            assert any(words in text for words in ("add_options(", "add_worker_options(", "parser_of("))
     assert sum(study.spread for study in STUDIES) >= 20
 
 

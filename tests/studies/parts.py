@@ -71,11 +71,16 @@ class TaskWorkers:
         return cls(given.jobs, given.backend, given.address, 60.0 * given.minutes)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of every command whose tasks are kept one by one."""
+def add_worker_options(parser: argparse.ArgumentParser) -> None:
+    """Options of every command that runs on several processes or a cluster."""
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--backend", choices=BACKENDS, default=BACKENDS[0], help="this machine, or a cluster")
     parser.add_argument("--address", metavar="tcp://HOST:PORT", help="the Dask cluster's scheduler")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of every command whose tasks are kept one by one."""
+    add_worker_options(parser)
     parser.add_argument("--minutes", type=float, default=600.0, help="stop after so long, with what there is")
 
 

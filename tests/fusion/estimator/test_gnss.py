@@ -469,8 +469,8 @@ def test_fixes_that_come_late_are_no_outage_before_they_are_overdue() -> None:
     estimator.gnss.last_used_ns = now_ns
     for delay_s, outage_from_s in ((0.0, 2.0), (2.5, 4.5)):
         estimator.gnss.delay_s = delay_s
-        assert not estimator._is_outage(now_ns + round((outage_from_s - 0.1) * 1e9))
-        assert estimator._is_outage(now_ns + round((outage_from_s + 0.1) * 1e9))
+        assert not estimator.gnss.is_outage(now_ns + round((outage_from_s - 0.1) * 1e9))
+        assert estimator.gnss.is_outage(now_ns + round((outage_from_s + 0.1) * 1e9))
 
 
 def started(heading_rad: float) -> Estimator:

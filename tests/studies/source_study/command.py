@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from terrafusion.twin.executors import BACKENDS
+from tests.studies.parts import add_worker_options
 from tests.studies.source_study.report import write_study
 from tests.studies.source_study.study import StudyPlan, run_study
 from tests.studies.source_study.text import document_section, quoted_lines
@@ -29,9 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder for tables and report")
     parser.add_argument("--quick", action="store_true", help="two seeds and a small batch")
     parser.add_argument("--seeds", type=int, help="seeds a case (10; 2 when quick)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--backend", choices=BACKENDS, default=BACKENDS[0], help="this machine, or a cluster")
-    parser.add_argument("--address", metavar="tcp://HOST:PORT", help="the Dask cluster's scheduler")
+    add_worker_options(parser)
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     plan = StudyPlan(seeds=given.seeds, quick=given.quick, jobs=given.jobs)
