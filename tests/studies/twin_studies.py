@@ -149,7 +149,7 @@ TWIN = (
             "--share",
             "0.25",
             "--seed",
-            "2711",
+            "3127",
             "--minutes",
             "40",
             "--no-opponent",
