@@ -34,8 +34,9 @@ ERROR_FROM_S = 0.5
 SLIDING_S = 2.0
 """The same where the others lag behind the wheels, as they do where a robot skids: at 1 m/s2 of traction it
 takes 3 s to reach 3 m/s, a mean delay of half of that."""
-LEAST_LATE_S, SIGNIFICANT_S = 0.3, 0.2
-"""Fixes count as late from the first on, with the interval of the delay beyond the second."""
+LEAST_LATE_S, SIGNIFICANT_S, MOST_REST = 0.3, 0.2, 0.97
+"""Fixes count as late from the first on, with the interval of the delay beyond the second, and where that
+leaves no more than this share of the residuals."""
 CALIBRATED_S = 3.0
 """Late fixes are no error up to this: the estimator finds such a delay by itself."""
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
@@ -109,7 +110,9 @@ def _confirms(pair: Pair, lag: Lag, off: dict[Pair, Lag]) -> bool:
 def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
     model = path_model(context, path_by(context.recording, "gnss"))
-    if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SIGNIFICANT_S):
+    if model is None or abs(model.delay_s.value) < LEAST_LATE_S or model.rest > MOST_REST:
+        return
+    if not model.delay_s.is_beyond(SIGNIFICANT_S):
         return
     late = model.delay_s
     beyond = min(abs(late.low), abs(late.high)) > CALIBRATED_S

@@ -41,11 +41,15 @@ delay fits clearly better than none."""
 
 @dataclass(frozen=True)
 class PathModel:
-    """Scale error of the gyro (0: right), and seconds by which the positions are late."""
+    """Scale error of the gyro (0: right), and seconds by which the positions are late.
+
+    `rest` is what a delay leaves of the residuals, over what none leaves.
+    """
 
     gyro_scale: BootstrapInterval
     delay_s: BootstrapInterval
     windows: int
+    rest: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -100,13 +104,12 @@ def path_model(context: CheckContext, measured: MeasuredPath | None) -> PathMode
     wide = _windows(context, measured, LONGEST_FAR_S)
     far_s = _far_start(wide) if wide is not None else None
     if wide is not None and far_s is not None:
-        return _fitted(wide, far_s, far_s, MOST_CLEAR_NOISE)
+        return _fitted(wide, far_s, far_s, CLEARLY)
     windows = _windows(context, measured, LONGEST_S)
     if windows is None:
         return None
     rest, start_s = min((_rest(windows, s), s) for s in STARTS_S.tolist())
-    clear = rest < CLEARLY * _rest(windows, 0.0)
-    return _fitted(windows, start_s, 0.0, MOST_CLEAR_NOISE if clear else MOST_NOISE)
+    return _fitted(windows, start_s, 0.0, rest / max(_rest(windows, 0.0), 1e-9))
 
 
 def _far_start(windows: _Windows) -> float | None:
@@ -118,7 +121,7 @@ def _far_start(windows: _Windows) -> float | None:
     return far_s if rest < CLEARLY * near else None
 
 
-def _fitted(windows: _Windows, start_s: float, usual_s: float, most_noise: float) -> PathModel | None:
+def _fitted(windows: _Windows, start_s: float, usual_s: float, rest: float) -> PathModel | None:
     """The model by steps from a delay; None where they lead too far, or the paths are unlike."""
     unknown, usual = np.array([0.0, start_s, 0.0, 0.0, 0.0]), np.array([0.0, usual_s, 0.0, 0.0, 0.0])
     for _ in range(STEPS):
@@ -130,6 +133,7 @@ def _fitted(windows: _Windows, start_s: float, usual_s: float, most_noise: float
         if abs(unknown[1] - usual_s) > LONGEST_S or abs(unknown[0]) > MOST_SCALE:
             return None
     H, h, noise = _normal(windows, unknown)
+    most_noise = MOST_CLEAR_NOISE if rest <= CLEARLY else MOST_NOISE
     if len(H) < LEAST_WINDOWS or noise > most_noise * windows.size_m():
         return None
     prior = np.diag(noise**2 / PRIOR**2)
@@ -142,7 +146,7 @@ def _fitted(windows: _Windows, start_s: float, usual_s: float, most_noise: float
         else BootstrapInterval(float(unknown[k]), -np.inf, np.inf)
         for k in range(2)
     )
-    return PathModel(scale, delay, len(H))
+    return PathModel(scale, delay, len(H), rest)
 
 
 def _contributing(information: Array) -> float:

@@ -108,7 +108,7 @@ def test_of_several_the_sharpest_lag_is_told(drive: Recording) -> None:
 def test_late_fixes(
     drive: Recording, monkeypatch: pytest.MonkeyPatch, value: float, low: float, high: float, words: str
 ) -> None:
-    model = SimpleNamespace(delay_s=BootstrapInterval(value, low, high), windows=17)
+    model = SimpleNamespace(delay_s=BootstrapInterval(value, low, high), windows=17, rest=0.9)
     monkeypatch.setattr(delays, "path_by", lambda *_: object())
     monkeypatch.setattr(delays, "path_model", lambda *_: model)
     found = list(delays._late_fixes(CheckContext(drive, None)))
@@ -121,6 +121,8 @@ def test_late_fixes(
         assert found[0].repair is not None
         moved = found[0].repair(drive).gnss
         assert moved is not None
+        model.rest = 0.98
+        assert not list(delays._late_fixes(CheckContext(drive, None))), "no delay fits as well"
         assert drive.gnss is not None
         np.testing.assert_array_equal(moved.t_ns, drive.gnss.t_ns - round(value * 1e9))
     monkeypatch.setattr(delays, "path_by", lambda *_: None)
