@@ -19,6 +19,7 @@ filter does; motion adds to P_s alone.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -119,7 +120,7 @@ class SlowBias:
         return Independent(innovation * state / a, float(np.sqrt(own)))
 
 
-class BiasedSensor(Generic[T]):
+class BiasedSensor(ABC, Generic[T]):
     """Samples (time, value) of a sensor with a slow bias, and the gate of its measurements.
 
     A measurement is used up to `GATE_SIGMA`; after `PATIENCE` rejected in a row the bias has jumped.
@@ -164,6 +165,6 @@ class BiasedSensor(Generic[T]):
             self._refused_in_a_row = 0
             self._has_jumped()
 
+    @abstractmethod
     def _has_jumped(self) -> None:
         """Forget the bias."""
-        raise NotImplementedError
