@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.grounds.signature import SIGNATURE
 
-SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.2])
+SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.2, 0.03])
 """Spread on one ground of the mean signature of 4 s, before any is known (learn runs of
-tests/studies/ground_split.yaml)."""
+tests/studies/ground_split.yaml; that of slip is assumed)."""
 WINDOW_VARIANCE = 4.0
 """Variance of single windows about that mean, in its own (learn runs)."""
 SPREAD_WINDOWS = 40.0
@@ -93,7 +93,7 @@ class Ground:
         return float(self.signature.count.max())
 
     def variance(self) -> Array:
-        """(10,) of a window's signature, shrunk to `SPREAD`."""
+        """(11,) of a window's signature, shrunk to `SPREAD`."""
         n = self.signature.count
         known = np.maximum(self.signature.square, 0.0)
         return np.asarray((SPREAD_WINDOWS * SPREAD**2 + n * known) / (SPREAD_WINDOWS + n))

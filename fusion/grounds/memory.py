@@ -73,7 +73,7 @@ class GroundMemory:
         return np.array([NEW_SHARE if k else 1.0, *[(1.0 - NEW_SHARE) / max(k, 1)] * k])
 
     def recognise(self, signature: Array, distance_m: float) -> Array:
-        """Belief (1 + K,) after one more window (10,), `distance_m` after the last."""
+        """Belief (1 + K,) after one more window (11,), `distance_m` after the last."""
         signature = self._mean(signature)
         drawn = -math.expm1(-distance_m / PATCH_M)
         belief = (1.0 - drawn) * self.belief + drawn * self._prior()

@@ -12,15 +12,17 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, periodogram, sample_rate_hz
 
 VIBRATION = ("z_low", "z_mid", "z_high", "xy_low", "xy_mid", "tilt_low", "tilt_mid")
-SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide")
+SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide", "slip")
 """log10 of band RMS over the baseline at 1 m/s (vertical, horizontal, roll and pitch); 1 - yaw rate of the
 gyro over that of the wheels; acceleration of the body over that of the wheels; probability of slippery
-friction by fixes, which tells grounds apart that are learned and is missing in an outage."""
+friction, and slip. Only fixes give the last two: they tell grounds apart that are learned."""
 
 BANDS_HZ = ((3.0, 8.0), (8.0, 14.0), (14.0, 45.0))
 LEAST_YAW_RADPS, LEAST_SURGE_MPS2 = 0.15, 0.3
 """Least yaw rate and acceleration of the wheels whose share is measurable (assumed)."""
 MOST_SHARE = 1.5
+CLEAR_SLIP = 0.03
+"""Most uncertain slip of a window that says more than the spread of slip on one ground."""
 STANDS = 0.02
 """Speed, m/s, and yaw rate, rad/s, below which a robot stands."""
 FLOORS = np.array([0.02] * 5 + [0.002] * 2)
@@ -34,7 +36,7 @@ class SignatureExtractor:
         self._quiet = np.full(len(FLOORS), np.nan)
 
     def extract(self, window: Window, slide: float = math.nan) -> Array:
-        """Signature (10,); all NaN while the robot stands."""
+        """Signature (11,); all NaN while the robot stands."""
         powers = _band_powers(window)
         speed = window.ground_speed_mps()
         if not speed > MIN_SPEED_MPS:
@@ -42,12 +44,14 @@ class SignatureExtractor:
                 self._quiet = np.fmin(self._quiet, powers)
             return np.full(len(SIGNATURE), np.nan)
         floor = FLOORS**2 + np.nan_to_num(self._quiet)
-        out = np.empty(len(SIGNATURE))
+        out = np.full(len(SIGNATURE), np.nan)
         out[:7] = 0.5 * np.log10(np.maximum(powers - np.nan_to_num(self._quiet), 0.0) / floor + 1.0)
         out[:7] -= 0.5 * math.log10(speed)
         out[7] = _yaw_slip(window)
         out[8] = _surge_share(window)
         out[9] = slide
+        if window.slip is not None and (window.slip_sigma or 0.0) < CLEAR_SLIP:
+            out[10] = window.slip
         return out
 
 

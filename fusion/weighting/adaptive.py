@@ -20,6 +20,7 @@ from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, slip_without_prior
 from terrafusion.fusion.weighting.driven_slip import DrivenSlip
+from terrafusion.fusion.weighting.ground_slip import GroundSlip
 from terrafusion.fusion.weighting.innovation import InnovationWeighting
 from terrafusion.fusion.weighting.robust import RobustWeighting
 from terrafusion.fusion.weighting.weighting import NOTEWORTHY, NoiseInForce, Weighting
@@ -57,18 +58,23 @@ class TerrainNoise:
         self.policy = config.tuning.adaptive.applied_to_policy(config.policy)
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
-        self.grounds = None if config.grounds is None else GroundLearner(config.grounds)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
         self._starts_pooled = model.slip_only
+        learns = config.grounds is not None or (self.adaptive and self._starts_pooled)
+        self.grounds = GroundLearner(config.grounds) if learns else None
         if self._starts_pooled:
             # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
-        self._driven = DrivenSlip(self.policy)
+        self._driven = DrivenSlip.of_policy(self.policy)
         self._slips, self._slip_times_s = self._driven.posterior(), self.policy.slips()[3].copy()
+        own, known = self.policy.classes[UNKNOWN], config.grounds.grounds if config.grounds else ()
+        self._ground_slip = GroundSlip(
+            own.slip_mean, own.slip_sigma, own.slip_per_grade, own.slip_time_s, known
+        )
         self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=MOST_CHANGES)
         self._recorded: SensorNoise | None = None
@@ -95,7 +101,7 @@ class TerrainNoise:
         self._slip_times_s = np.minimum(self.policy.slips()[3], time_s)
         if self._starts_pooled:
             own = self.detector.classes.index(UNKNOWN)
-            self._slips[0][own], self._slips[1][own] = mean, sigma
+            self._ground_slip.expect(mean, sigma, float(self._slip_times_s[own]))
         self._reweight(t_ns)
 
     def learned_grounds(self) -> GroundMemory | None:
@@ -119,7 +125,7 @@ class TerrainNoise:
         p = self._shares
         moved = 0.5 * float(np.abs(p - self._before).sum())
         self._before = p
-        return moved
+        return max(moved, self._ground_slip.take_switch()) if self._starts_pooled else moved
 
     def begin(self, t_ns: int) -> None:
         """Start the clock; the first noise is a change from the policy's fixed one."""
@@ -168,22 +174,33 @@ class TerrainNoise:
         self._next_ns = state.t_ns + UPDATE_NS
         window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
-        self._learn_driven_slip(window)
+        ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
+        self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
-            self.grounds.update(window, state, rolled_m, friction)
+            self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
+            self._ground_slip.recognise(self.grounds.memory.belief)
+        self._learn_driven_slip(window)
         self._source = "detector"
         self._apply_labels(state.t_ns)
-        ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
-        self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
+
+    def _on_the_level(self, window: Window) -> Window:
+        """The window without the slip that the grade makes."""
+        if window.slip is None:
+            return window
+        return dataclasses.replace(window, slip=window.slip - self.noise.slip_per_grade * self._grade)
 
     def _learn_driven_slip(self, window: Window) -> None:
         """Take the slip of the window for that of its ground, where the model knows the robot's grounds."""
-        if not self.adaptive or self._starts_pooled or window.slip is None or window.slip_sigma is None:
+        if not self.adaptive or window.slip is None or window.slip_sigma is None:
             return
-        if window.ground_speed_mps() > MIN_SPEED_MPS:
+        if not window.ground_speed_mps() > MIN_SPEED_MPS:
+            return
+        if self._starts_pooled:
+            self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s)
+        else:
             self._driven.add(self._probabilities, window.slip, window.slip_sigma, self._grade, window.dt_s)
             self._slips = self._driven.posterior()
 
@@ -242,6 +259,9 @@ class TerrainNoise:
         if not self.adaptive:
             return
         p = self._probabilities
+        if self._starts_pooled:
+            own = self.detector.classes.index(UNKNOWN)
+            self._slips[0][own], self._slips[1][own] = self._ground_slip.mean, self._ground_slip.sigma
         self.noise = self.policy.blend(self._shares, self._grade, (*self._slips, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return

@@ -10,6 +10,7 @@ observations.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.noise.policy import Policy
@@ -23,15 +24,32 @@ WINDOW_S = 1.0
 
 
 class DrivenSlip:
-    """Time, mean and scatter of the slip on each class of a policy, on the level."""
+    """Time, mean and scatter of the slip on each of k grounds, on the level.
 
-    def __init__(self, policy: Policy) -> None:
-        self._prior, self._prior_sigma, self._per_grade, self._time_s = policy.slips()
-        self._within = WITHIN * self._prior_sigma**2
-        self._between = policy.fixed.slip_sigma**2
-        k = len(self._prior)
+    Args:
+        prior, sigma, per_grade, time_s: (k,) mean, 1 sigma, slope over the grade and correlation time (s) of
+            the slip that is expected before it is seen.
+        between: 1 sigma, one or (k,), by which the mean slip may be off.
+    """
+
+    def __init__(
+        self, prior: Array, sigma: Array, per_grade: Array, time_s: Array, between: Array | float
+    ) -> None:
+        self._per_grade = per_grade
+        self.expect(prior, sigma, time_s, between)
+        k = len(prior)
         self._driven_s, self._known, self._mean = np.zeros(k), np.zeros(k), np.zeros(k)
         self._count, self._square = np.zeros(k), np.zeros(k)
+
+    def expect(self, prior: Array, sigma: Array, time_s: Array, between: Array | float) -> None:
+        """Another prior, as above; what was seen stays."""
+        self._prior, self._prior_sigma, self._time_s = prior, sigma, time_s
+        self._within, self._between = WITHIN * sigma**2, between**2
+
+    @classmethod
+    def of_policy(cls, policy: Policy) -> "DrivenSlip":
+        """Of the classes of a policy."""
+        return cls(*policy.slips(), policy.fixed.slip_sigma)
 
     def add(self, probabilities: Array, slip: float, sigma: float, grade: float, dt_s: float) -> None:
         """One window: class probabilities (k,), slip by the measurements alone with its 1 sigma, grade.
@@ -51,11 +69,19 @@ class DrivenSlip:
         self._mean = self._mean + gain * off
 
     def posterior(self) -> tuple[Array, Array]:
-        """Mean and 1 sigma (k,) of the slip to expect on each class."""
-        seen, n = self._known > 0.0, self._count
-        changes = self._within * 2.0 * self._time_s / (self._driven_s + 2.0 * self._time_s)
-        variance = 1.0 / np.where(seen, self._known, 1.0) + changes
+        """Mean and 1 sigma (k,) of the slip to expect on each ground."""
+        seen, n, variance = self._known > 0.0, self._count, self._variance()
         share = np.where(seen, self._between / (self._between + variance), 0.0)
         spread = (PRIOR_SPREAD * self._within + self._square) / (PRIOR_SPREAD + n)
         sigma = np.sqrt(spread + share * variance)
         return self._prior + share * (self._mean - self._prior), np.where(seen, sigma, self._prior_sigma)
+
+    def contradicted(self, sigmas: float) -> NDArray[np.bool_]:
+        """On which grounds (k,) the slip of the drive is further than so many sigmas from the prior's."""
+        apart = (self._mean - self._prior) ** 2 / (self._between + self._variance())
+        return np.asarray((self._known > 0.0) & (apart > sigmas**2))
+
+    def _variance(self) -> Array:
+        """Of the mean slip (k,) that the drive has shown."""
+        changes = self._within * 2.0 * self._time_s / (self._driven_s + 2.0 * self._time_s)
+        return 1.0 / np.where(self._known > 0.0, self._known, 1.0) + changes

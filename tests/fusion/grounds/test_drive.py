@@ -1,4 +1,4 @@
-"""Ground memory in a drive: learned, carried to the next one, live, dumped; fixed mode does not change."""
+"""Ground memory in a drive: learned, carried to the next one, live, dumped; fixed mode does not use it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.file import save_grounds
-from terrafusion.fusion.grounds.ground import FRICTION_MODELS
+from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.twin.model.vehicle import as_vehicle
 
@@ -38,16 +38,30 @@ def test_a_drive_adds_to_the_memory_and_the_next_one_goes_on(drive: Recording, t
     assert second.grounds[0].windows > 1.5 * first.grounds[0].windows
 
 
-def test_what_is_remembered_changes_no_bit(drive: Recording) -> None:
+def test_what_is_remembered_changes_no_bit_of_fixed_weights(drive: Recording) -> None:
     """Even where the remembered ground is said to be ice."""
-    memory = tf.replay(drive, grounds=GroundMemory()).grounds
+    memory = tf.replay(drive).grounds
     assert memory is not None
     ice = dataclasses.replace(memory.grounds[0], friction=np.eye(FRICTION_MODELS)[0], friction_windows=1000.0)
-    plain, remembered = (tf.replay(drive, grounds=g) for g in (None, GroundMemory([ice])))
+    plain, remembered = (tf.replay(drive, mode="fixed", grounds=g) for g in (None, GroundMemory([ice])))
     np.testing.assert_array_equal(
         plain.estimate.trajectory.position_m, remembered.estimate.trajectory.position_m
     )
     assert plain.grounds is None
+
+
+def test_a_poisoned_memory_makes_the_estimate_no_worse(drive: Recording) -> None:
+    """A ground of the memory is said to slip by a half: fixes contradict it."""
+    memory = tf.replay(drive).grounds
+    assert memory is not None
+    motion = Tally(np.full(2, 100.0), np.array([0.5, 0.0]), np.full(2, 1e-4))
+    poison = GroundMemory([dataclasses.replace(g, motion=motion) for g in memory.grounds])
+    outage = [(20.0, 8.0)]
+    plain, poisoned = (tf.replay(drive, grounds=g, outages=outage) for g in (None, poison))
+    errors = [result.scores.outages[0].end_error_m for result in (plain, poisoned)]
+    assert errors[0] is not None
+    assert errors[1] is not None
+    assert errors[1] < errors[0] + 0.1
 
 
 def test_a_dump_goes_on_with_the_same_memory(drive: Recording) -> None:

@@ -19,14 +19,14 @@ PRIOR, PRIOR_SIGMA, PER_GRADE, TIME_S = POLICY.slips()
 
 def driven(seconds: float, slip: float, sigma: float = 0.01, grade: float = 0.0) -> DrivenSlip:
     """After `seconds` on loose sand with one slip on the level."""
-    found = DrivenSlip(POLICY)
+    found = DrivenSlip.of_policy(POLICY)
     for _ in range(round(seconds / 0.5)):
         found.add(ON_SAND, slip + PER_GRADE[SAND] * grade, sigma, grade, 0.5)
     return found
 
 
 def test_without_evidence_it_is_the_policys_to_the_last_bit() -> None:
-    mean, sigma = DrivenSlip(POLICY).posterior()
+    mean, sigma = DrivenSlip.of_policy(POLICY).posterior()
     assert mean.tolist() == PRIOR.tolist()
     assert sigma.tolist() == PRIOR_SIGMA.tolist()
     mixed = np.full(len(PRIOR), 1.0 / len(PRIOR))
@@ -58,7 +58,7 @@ def test_slip_that_is_measured_badly_counts_little_and_slip_that_varies_stays_wi
     own = PRIOR[SAND] + 0.06
     good, bad = (driven(5.0, own, sigma).posterior()[0][SAND] for sigma in (0.01, 0.5))
     assert abs(bad - PRIOR[SAND]) < 0.2 * abs(good - PRIOR[SAND])
-    varying = DrivenSlip(POLICY)
+    varying = DrivenSlip.of_policy(POLICY)
     for k in range(400):
         varying.add(ON_SAND, 0.13 + (0.15 if k % 20 < 10 else -0.15), 0.01, 0.0, 0.5)
     assert varying.posterior()[1][SAND] > 0.12
@@ -68,7 +68,7 @@ def test_a_ground_that_the_policy_lacks_shows_its_slip_within_a_minute() -> None
     """Snow that looks like asphalt: 4 % slip where asphalt has .1 %, each second measured to 3 %."""
     asphalt, rng = POLICY.names().index("asphalt"), np.random.default_rng(3)
     looks_like = np.where(np.arange(len(PRIOR)) == asphalt, 0.9, 0.1 / (len(PRIOR) - 1))
-    found = DrivenSlip(POLICY)
+    found = DrivenSlip.of_policy(POLICY)
     for _ in range(80):
         found.add(looks_like, 0.04 + rng.normal(0.0, 0.03), 0.03, 0.0, 0.5)
     mean, sigma = found.posterior()
@@ -83,7 +83,7 @@ def test_slip_of_half_a_minute_outweighs_that_of_the_class_it_looks_like(slip: f
 
 
 def test_a_ground_that_is_less_likely_than_another_learns_nothing() -> None:
-    found, halves = DrivenSlip(POLICY), np.zeros(len(PRIOR))
+    found, halves = DrivenSlip.of_policy(POLICY), np.zeros(len(PRIOR))
     halves[:2] = 0.5
     found.add(halves, 0.3, 0.01, 0.0, 60.0)
     assert found.posterior()[0].tolist() == PRIOR.tolist()
@@ -110,7 +110,7 @@ def test_learned_slip_survives_a_dump(robot: str) -> None:
 
 def test_mean_and_spread_are_those_of_two_normals_by_hand() -> None:
     """Two windows of four correlation times, measured as badly as the policy's slip spreads."""
-    found, sigma, driven_s = DrivenSlip(POLICY), PRIOR_SIGMA[SAND], 8.0 * TIME_S[SAND]
+    found, sigma, driven_s = DrivenSlip.of_policy(POLICY), PRIOR_SIGMA[SAND], 8.0 * TIME_S[SAND]
     for off in (0.03, 0.09):
         found.add(ON_SAND, PRIOR[SAND] + off, sigma, 0.0, 0.5 * driven_s)
     mean, spread = (values[SAND] for values in found.posterior())

@@ -163,8 +163,11 @@ def test_noise_begins_on_the_level() -> None:
     assert weights.noise == weights.policy.blend(p, 0.0, (mean, sigma, time_s))
 
 
-def test_grounds_are_learned_only_where_a_memory_is_given() -> None:
-    assert noise_of().learned_grounds() is None
-    memory = noise_of(grounds=GroundMemory()).learned_grounds()
-    assert memory is not None
-    assert len(memory) == 0
+def test_grounds_are_learned_where_no_model_knows_them_or_a_memory_is_given() -> None:
+    assert noise_of("elevate").learned_grounds() is None
+    for memory in (
+        noise_of("husky").learned_grounds(),
+        noise_of("elevate", grounds=GroundMemory()).learned_grounds(),
+    ):
+        assert memory is not None
+        assert len(memory) == 0

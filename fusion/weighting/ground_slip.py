@@ -1,0 +1,85 @@
+"""Slip of the grounds that a robot has found by itself, where no model knows its grounds.
+
+The ground memory tells grounds apart by what the robot feels (`grounds.memory`). While fixes are good, each
+of them shows its slip. Where a ground is recognised again, in an outage too, its own slip is expected; on
+ground that was never met, the slip of the whole drive.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.grounds.ground import Ground
+from terrafusion.fusion.grounds.memory import MOST_GROUNDS
+from terrafusion.fusion.weighting.driven_slip import DrivenSlip
+
+WINDOWS_PER_OBSERVATION = 20.0
+"""Estimates of slip are correlated over about 10 s, as receivers drift; windows come twice a second."""
+LEAST_STRETCHES = 3.0
+"""Stretches from which the slip of a ground on earlier drives counts."""
+BETWEEN_DRIVES = 0.03
+"""1 sigma of the mean slip of one ground between drives: weather, load and tyre pressure (assumed)."""
+STALE = 3.0
+"""Sigmas by which the slip of the drive contradicts that of earlier ones, which is then forgotten."""
+
+
+class GroundSlip:
+    """Mean and 1 sigma of the slip to expect, by the belief which ground the robot is on.
+
+    Args:
+        mean, sigma, per_grade, time_s: of the slip of the whole drive, before it is seen: mean and 1 sigma on
+            the level, slope over the grade, correlation time.
+        known: the grounds of earlier drives, in the order of the memory.
+
+    Attributes:
+        mean, sigma: of the slip on the level, now.
+    """
+
+    def __init__(
+        self, mean: float, sigma: float, per_grade: float, time_s: float, known: Sequence[Ground] = ()
+    ) -> None:
+        k = 1 + MOST_GROUNDS
+        self._known = {i: g for i, g in enumerate(known, 1) if g.motion.count[0] >= LEAST_STRETCHES}
+        self._belief = np.eye(k)[0]
+        self._slip = DrivenSlip(*(np.full(k, x) for x in (mean, sigma, per_grade, time_s, sigma)))
+        self.mean, self.sigma, self._before = mean, sigma, mean
+        self.expect(mean, sigma, time_s)
+
+    def expect(self, mean: float, sigma: float, time_s: float) -> None:
+        """Another slip of the whole drive."""
+        means, sigmas, times_s, between = (np.full(1 + MOST_GROUNDS, x) for x in (mean, sigma, time_s, sigma))
+        for i, ground in self._known.items():
+            means[i], between[i] = ground.motion.mean[0], BETWEEN_DRIVES
+            sigmas[i] = math.hypot(math.sqrt(max(float(ground.motion.square[0]), 0.0)), BETWEEN_DRIVES)
+        self._whole = mean, sigma, time_s
+        self._slip.expect(means, sigmas, times_s, between)
+        self._blend()
+
+    def recognise(self, belief: Array) -> None:
+        """Take over the probability (1 + K,) of new ground, then of each known one."""
+        self._belief = np.zeros(1 + MOST_GROUNDS)
+        self._belief[: len(belief)] = belief
+        self._blend()
+
+    def learn(self, slip: float, sigma: float, grade: float, dt_s: float) -> None:
+        """Slip with its 1 sigma, as measured for `dt_s` on the ground that the robot is on."""
+        known = np.append(0.0, self._belief[1:])
+        self._slip.add(known, slip, sigma * math.sqrt(WINDOWS_PER_OBSERVATION), grade, dt_s)
+        stale = [i for i in self._known if self._slip.contradicted(STALE)[i]]
+        if stale:
+            self._known = {i: ground for i, ground in self._known.items() if i not in stale}
+            self.expect(*self._whole)
+
+    def take_switch(self) -> float:
+        """How far the expected slip has changed since the last call: from 0, not at all, to 1, many sigma."""
+        apart = (self.mean - self._before) / self.sigma
+        self._before = self.mean
+        return -math.expm1(-0.5 * apart * apart)
+
+    def _blend(self) -> None:
+        """Moments of the mixture of the grounds."""
+        means, sigmas = self._slip.posterior()
+        self.mean = float(self._belief @ means)
+        self.sigma = math.sqrt(float(self._belief @ (sigmas**2 + (means - self.mean) ** 2)))
