@@ -9,6 +9,9 @@ leaves the variance sigma^2 2 t / (T + 2 t). The spread about the mean is the po
 observations.
 """
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,33 +26,50 @@ WINDOW_S = 1.0
 """Duration of a window; those that overlap share their measurement."""
 
 
+@dataclass(frozen=True, eq=False)
+class SlipPrior:
+    """What is expected of the slip on each of k grounds, on the level, before it is seen; (k,) each.
+
+    Attributes:
+        mean, sigma: of the slip.
+        within: its 1 sigma during a drive, about the mean of that drive.
+        between: 1 sigma of the means of drives, or grounds, about `mean`.
+        time_s: correlation time on one ground.
+    """
+
+    mean: Array
+    sigma: Array
+    within: Array
+    between: Array
+    time_s: Array
+
+    @classmethod
+    def of_policy(cls, policy: Policy) -> "SlipPrior":
+        """Of the classes of a policy; what looks like one of them may be another ground."""
+        mean, sigma, _, time_s = policy.slips()
+        return cls(
+            mean, sigma, math.sqrt(WITHIN) * sigma, np.full(len(mean), policy.fixed.slip_sigma), time_s
+        )
+
+
 class DrivenSlip:
     """Time, mean and scatter of the slip on each of k grounds, on the level.
 
-    Args:
-        prior, sigma, per_grade, time_s: (k,) mean, 1 sigma, slope over the grade and correlation time (s) of
-            the slip that is expected before it is seen.
-        between: 1 sigma, one or (k,), by which the mean slip may be off.
+    Attributes:
+        prior: what is expected; another one may take its place, and what was seen stays.
     """
 
-    def __init__(
-        self, prior: Array, sigma: Array, per_grade: Array, time_s: Array, between: Array | float
-    ) -> None:
-        self._per_grade = per_grade
-        self.expect(prior, sigma, time_s, between)
-        k = len(prior)
+    def __init__(self, prior: SlipPrior, per_grade: Array) -> None:
+        """`per_grade` (k,): slope of the slip over the grade."""
+        self.prior, self._per_grade = prior, per_grade
+        k = len(prior.mean)
         self._driven_s, self._known, self._mean = np.zeros(k), np.zeros(k), np.zeros(k)
         self._count, self._square = np.zeros(k), np.zeros(k)
-
-    def expect(self, prior: Array, sigma: Array, time_s: Array, between: Array | float) -> None:
-        """Another prior, as above; what was seen stays."""
-        self._prior, self._prior_sigma, self._time_s = prior, sigma, time_s
-        self._within, self._between = WITHIN * sigma**2, between**2
 
     @classmethod
     def of_policy(cls, policy: Policy) -> "DrivenSlip":
         """Of the classes of a policy."""
-        return cls(*policy.slips(), policy.fixed.slip_sigma)
+        return cls(SlipPrior.of_policy(policy), policy.slips()[2])
 
     def add(self, probabilities: Array, slip: float, sigma: float, grade: float, dt_s: float) -> None:
         """One window: class probabilities (k,), slip by the measurements alone with its 1 sigma, grade.
@@ -63,25 +83,26 @@ class DrivenSlip:
         self._known = self._known + weight
         off = slip - self._per_grade * grade - self._mean
         gain = weight / np.maximum(self._known, 1e-12)
-        informative = self._prior_sigma**2 / (self._prior_sigma**2 + sigma * sigma)
-        count = shares * informative * dt_s / (2.0 * self._time_s)
+        informative = self.prior.sigma**2 / (self.prior.sigma**2 + sigma * sigma)
+        count = shares * informative * dt_s / (2.0 * self.prior.time_s)
         self._count, self._square = self._count + count, self._square + count * (1.0 - gain) * off**2
         self._mean = self._mean + gain * off
 
     def posterior(self) -> tuple[Array, Array]:
         """Mean and 1 sigma (k,) of the slip to expect on each ground."""
-        seen, n, variance = self._known > 0.0, self._count, self._variance()
-        share = np.where(seen, self._between / (self._between + variance), 0.0)
-        spread = (PRIOR_SPREAD * self._within + self._square) / (PRIOR_SPREAD + n)
+        prior, seen, variance = self.prior, self._known > 0.0, self._variance()
+        share = np.where(seen, prior.between**2 / (prior.between**2 + variance), 0.0)
+        spread = (PRIOR_SPREAD * prior.within**2 + self._square) / (PRIOR_SPREAD + self._count)
         sigma = np.sqrt(spread + share * variance)
-        return self._prior + share * (self._mean - self._prior), np.where(seen, sigma, self._prior_sigma)
+        return prior.mean + share * (self._mean - prior.mean), np.where(seen, sigma, prior.sigma)
 
     def contradicted(self, sigmas: float) -> NDArray[np.bool_]:
-        """On which grounds (k,) the slip of the drive is further than so many sigmas from the prior's."""
-        apart = (self._mean - self._prior) ** 2 / (self._between + self._variance())
+        """On which grounds (k,) the slip of the drive is so many sigmas from what was expected."""
+        apart = (self._mean - self.prior.mean) ** 2 / (self.prior.between**2 + self._variance())
         return np.asarray((self._known > 0.0) & (apart > sigmas**2))
 
     def _variance(self) -> Array:
         """Of the mean slip (k,) that the drive has shown."""
-        changes = self._within * 2.0 * self._time_s / (self._driven_s + 2.0 * self._time_s)
+        lasts_s = 2.0 * self.prior.time_s
+        changes = self.prior.within**2 * lasts_s / (self._driven_s + lasts_s)
         return 1.0 / np.where(self._known > 0.0, self._known, 1.0) + changes

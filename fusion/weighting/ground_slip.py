@@ -13,12 +13,14 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.grounds.ground import Ground
 from terrafusion.fusion.grounds.memory import MOST_GROUNDS
-from terrafusion.fusion.weighting.driven_slip import DrivenSlip
+from terrafusion.fusion.weighting.driven_slip import DrivenSlip, SlipPrior
 
 WINDOWS_PER_OBSERVATION = 20.0
 """Estimates of slip are correlated over about 10 s, as receivers drift; windows come twice a second."""
 LEAST_STRETCHES = 3.0
 """Stretches from which the slip of a ground on earlier drives counts."""
+WITHIN, TIME_S = 0.04, 5.0
+"""1 sigma of the slip on one ground during a drive, and how long it lasts: those of sand in the policy."""
 BETWEEN_DRIVES = 0.03
 """1 sigma of the mean slip of one ground between drives: weather, load and tyre pressure (assumed)."""
 STALE = 3.0
@@ -43,19 +45,24 @@ class GroundSlip:
         k = 1 + MOST_GROUNDS
         self._known = {i: g for i, g in enumerate(known, 1) if g.motion.count[0] >= LEAST_STRETCHES}
         self._belief = np.eye(k)[0]
-        self._slip = DrivenSlip(*(np.full(k, x) for x in (mean, sigma, per_grade, time_s, sigma)))
+        self._slip = DrivenSlip(self._prior(mean, sigma, time_s), np.full(k, per_grade))
         self.mean, self.sigma, self._before = mean, sigma, mean
         self.expect(mean, sigma, time_s)
 
     def expect(self, mean: float, sigma: float, time_s: float) -> None:
         """Another slip of the whole drive."""
-        means, sigmas, times_s, between = (np.full(1 + MOST_GROUNDS, x) for x in (mean, sigma, time_s, sigma))
-        for i, ground in self._known.items():
-            means[i], between[i] = ground.motion.mean[0], BETWEEN_DRIVES
-            sigmas[i] = math.hypot(math.sqrt(max(float(ground.motion.square[0]), 0.0)), BETWEEN_DRIVES)
         self._whole = mean, sigma, time_s
-        self._slip.expect(means, sigmas, times_s, between)
+        self._slip.prior = self._prior(mean, sigma, time_s)
         self._blend()
+
+    def _prior(self, mean: float, sigma: float, time_s: float) -> SlipPrior:
+        """The slip of the whole drive for each ground; on those of earlier drives their own."""
+        whole = (mean, sigma, min(WITHIN, sigma), sigma, min(TIME_S, time_s))
+        prior = SlipPrior(*(np.full(1 + MOST_GROUNDS, x) for x in whole))
+        for i, ground in self._known.items():
+            prior.mean[i], prior.between[i] = ground.motion.mean[0], BETWEEN_DRIVES
+            prior.sigma[i] = math.hypot(math.sqrt(max(float(ground.motion.square[0]), 0.0)), BETWEEN_DRIVES)
+        return prior
 
     def recognise(self, belief: Array) -> None:
         """Take over the probability (1 + K,) of new ground, then of each known one."""
