@@ -1,7 +1,5 @@
 """The grounds of one robot: recognised from signatures, learned without labels, never with positions.
 
-A record for the user: nothing in the estimate depends on it.
-
 A filter over the known grounds and *new ground* follows the drive, as `terrain.sequence` does. Windows that
 no ground explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and Jordan 2012, ICML); grounds
 that came to look alike are merged.

@@ -46,7 +46,7 @@ class GroundSlip:
         self._known = {i: g for i, g in enumerate(known, 1) if g.motion.count[0] >= LEAST_STRETCHES}
         self._belief = np.eye(k)[0]
         self._slip = DrivenSlip(self._prior(mean, sigma, time_s), np.full(k, per_grade))
-        self.mean, self.sigma, self._before = mean, sigma, mean
+        self._followed = mean  # the mean that the slip of the robot follows
         self.expect(mean, sigma, time_s)
 
     def expect(self, mean: float, sigma: float, time_s: float) -> None:
@@ -80,10 +80,13 @@ class GroundSlip:
             self.expect(*self._whole)
 
     def take_switch(self) -> float:
-        """How far the expected slip has changed since the last call: from 0, not at all, to 1, many sigma."""
-        apart = (self.mean - self._before) / self.sigma
-        self._before = self.mean
-        return -math.expm1(-0.5 * apart * apart)
+        """Share of the slip to renew: 0 where it follows the mean that is now expected, 1 where that mean
+        is many sigma away.
+        """
+        apart = (self.mean - self._followed) / self.sigma
+        share = -math.expm1(-0.5 * apart * apart)
+        self._followed += share * (self.mean - self._followed)
+        return share
 
     def _blend(self) -> None:
         """Moments of the mixture of the grounds."""

@@ -23,6 +23,20 @@ ESTIMATOR = (
         spread=True,
     ),
     Study(
+        "found_grounds",
+        "What do adaptive weights gain on several grounds with robots that no terrain model knows?",
+        module("found_grounds", "--out", OUT),
+        12,
+        {
+            f"{setting}_{mode}": rf"{setting} all +[\d.]+"
+            + r" +[\d.]+ \[[\d.]+, [\d.]+\]" * i
+            + r" +([\d.]+ \[[\d.]+, [\d.]+\])"
+            for setting in ("mixed", "other_laws", "other_grounds", "coarse_fixes", "firm")
+            for i, mode in enumerate(("adaptive", "memory", "told"))
+        },
+        spread=True,
+    ),
+    Study(
         "outage_causes",
         "What makes the error at the end of the demo's outage, and of mixed ground in the benchmark?",
         module("outage_causes", "--arms", "fixed;adaptive", "--out", OUT),

@@ -10,13 +10,18 @@ import pytest
 
 import terrafusion as tf
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark.outage_plan import until
+from terrafusion.fusion.benchmark.methods import true_labels
+from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.file import save_grounds
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
 from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import as_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate_run
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +86,28 @@ def test_a_dump_goes_on_with_the_same_memory(drive: Recording) -> None:
     assert other is not None
     assert [g.windows for g in own.grounds] == [g.windows for g in other.grounds]
     np.testing.assert_array_equal(own.grounds[0].signature.mean, other.grounds[0].signature.mean)
+
+
+def test_a_ground_met_again_in_an_outage_slips_as_it_did_before() -> None:
+    """A robot that no model knows goes from asphalt to sand three times, the last time without fixes."""
+    legs = (RouteLeg("asphalt", 35.0), RouteLeg("loose_sand", 35.0)) * 3
+    weave = DriveSegment(175.0, 1.0, yaw_rate_amplitude_radps=0.2, period_s=10.0)
+    scenario = Scenario(
+        name="legs", description="asphalt and sand in turn", duration_s=180.0,
+        drive=(DriveSegment(5.0), weave), route=legs,
+    )  # fmt: skip
+    log = aided_by_truth(simulate_run(scenario, vehicle="husky", seed=1).recording, 1)
+    labels, slips = true_labels(log), dict[str, list[float]]()
+    assert labels is not None
+
+    def watch(estimator: Estimator) -> None:
+        state = estimator.latest()
+        assert state is not None
+        if state.status == "outage":
+            slips.setdefault(labels.at(state.t_ns), []).append(estimator.weights.noise.slip_mean)
+
+    end_m = replay(log, outages=[Outage(125.0, 50.0)], watch=watch).scores.outages[0].end_error_m
+    assert end_m is not None
+    assert end_m < 1.0  # 2 % of the path; the slip of the whole drive alone would be off by 7 %
+    assert np.median(slips["loose_sand"]) == pytest.approx(0.14, abs=0.04)
+    assert np.median(slips["asphalt"]) == pytest.approx(0.0, abs=0.02)
