@@ -9,12 +9,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from terrafusion.datasets.catalog.catalog import CatalogFile, at_hand, data_folders, load_catalog
+from terrafusion.datasets.catalog.catalog import at_hand, data_folders, load_catalog
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
-from terrafusion.fusion.benchmark.joined_windows import joined_runs
 from terrafusion.fusion.benchmark.methods import known_labels, true_labels
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
 from terrafusion.fusion.benchmark.twin_runs import FIELD, BenchmarkRun
@@ -25,13 +24,9 @@ from terrafusion.twin.model.choose import choose_vehicle
 AID_SEED = 1
 """Of the noise of fixes simulated from truth."""
 NOT_LABELLED = "not labelled"
-WHOLE, CUT = "raw", "windows"
-"""Windows cut from a run that the catalogue also has as a whole are left out."""
+CUT = "windows"
+"""Last word of the name of a recording that is cut into windows of seconds."""
 OUTAGES_S = (30.0, 60.0, 120.0)
-MIN_RUN_S = 10.0
-"""Shorter recordings are windows cut from a run: consecutive ones are joined."""
-MIN_JOINED_S = 25.0
-"""Shorter joined runs are left out: no outage fits into them."""
 MIN_LEAD_M = 5.0
 """Wheel path before an outage: fixes do not show the heading of a robot at rest."""
 MIN_OUTAGE_M = 3.0
@@ -71,13 +66,36 @@ class FieldLog:
 
 
 def present_logs(starts: int) -> list[FieldLog]:
-    """Logs of the catalogue whose files are present."""
-    return [FieldLog(name, starts) for name in catalogued()]
+    """Logs of the catalogue whose files are present; an outage fits into none of those cut into windows."""
+    return [FieldLog(name, starts) for name in present_recordings() if not name.endswith(f"/{CUT}")]
 
 
 def runs_of(log: FieldLog) -> list[BenchmarkRun | Refusal]:
     """All runs of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
-    return each_run(log.name, lambda name, _, recording: _outage_runs(log, name, recording))
+    out: list[BenchmarkRun | Refusal] = []
+    recordings = attempted(log.name, lambda: opened(log.name))
+    for i, one in enumerate(recordings):
+        name = log.name if len(recordings) == 1 else f"{log.name}#{i}"
+        if isinstance(one, Refusal):
+            out.append(one)
+        else:
+            out += attempted(name, functools.partial(_outage_runs, log, name, one))
+    return out
+
+
+def attempted(name: str, work: Callable[[], Iterable[Result | Refusal]]) -> list[Result | Refusal]:
+    """What `work` gives for the log or run of a name; an error becomes a `Refusal`."""
+    try:
+        with errors_of(name):
+            return list(work())
+    except (TerrafusionError, *UNFORESEEN) as error:
+        return [refusal_of(name, error)]
+
+
+@functools.lru_cache(maxsize=1)
+def opened(log: str) -> list[Recording]:
+    """The recordings of a log, cached for consecutive methods."""
+    return open_recordings(log)
 
 
 def _outage_runs(log: FieldLog, name: str, recording: Recording) -> Iterator[BenchmarkRun]:
@@ -103,35 +121,11 @@ def _outage_runs(log: FieldLog, name: str, recording: Recording) -> Iterator[Ben
         )
 
 
-def catalogued() -> list[str]:
-    """Recordings of the catalogue whose files are all present, without windows cut from another of them."""
+def present_recordings() -> list[str]:
+    """Names of the recordings of the catalogue whose files are all present."""
     folders = data_folders()
-
-    def complete(files: list[CatalogFile]) -> bool:
-        return all(at_hand(entry, folders) is not None for entry in files)
-
-    names = [name for name, files in load_catalog().recordings().items() if complete(files)]
-    cut = {f"{name.removesuffix(WHOLE)}{CUT}" for name in names if name.endswith(f"/{WHOLE}")}
-    return [name for name in names if name not in cut]
-
-
-def each_run(
-    log: str, run: Callable[[str, int, Recording], Iterable[Result | Refusal]]
-) -> list[Result | Refusal]:
-    """Results of `run(name, number, recording)` for every run of a log; an error becomes a `Refusal`."""
-    out: list[Result | Refusal] = []
-    try:
-        recordings, joined = read_runs(log)
-    except (TerrafusionError, *UNFORESEEN) as error:
-        return [refusal_of(log, error)]
-    for i, recording in enumerate(recordings):
-        name = log if joined or len(recordings) == 1 else f"{log}#{i}"
-        try:
-            with errors_of(name):
-                out += run(name, i, recording)
-        except (TerrafusionError, *UNFORESEEN) as error:
-            out.append(refusal_of(name, error))
-    return out
+    recordings = load_catalog().recordings().items()
+    return [name for name, files in recordings if all(at_hand(one, folders) is not None for one in files)]
 
 
 def refusal_of(name: str, error: Exception) -> Refusal:
@@ -147,22 +141,6 @@ def refusal_of(name: str, error: Exception) -> Refusal:
         remedy=error.remedy,
     )
     return Refusal(name, str(reason))
-
-
-@functools.lru_cache(maxsize=1)
-def read_runs(log: str) -> tuple[list[Recording], bool]:
-    """The runs of a log, and whether they were joined from windows; cached for consecutive modes."""
-    recordings = open_recordings(log)
-    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= MIN_RUN_S:
-        return recordings, False
-    joined = [run for run in joined_runs(log, recordings) if run.duration_s() >= MIN_JOINED_S]
-    runs = [run for run in joined if run.truth is not None]
-    if not runs:
-        raise DataError(
-            f"holds {len(recordings)} windows that form no run of {MIN_JOINED_S:g} s with a truth",
-            remedy="give a log of one run",
-        )
-    return runs, True
 
 
 def check_log(recording: Recording) -> None:

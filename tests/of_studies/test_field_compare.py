@@ -14,9 +14,9 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field import compare, summary
 from tests.studies.twin_field.field_run import FieldRun
 from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks, forks_of

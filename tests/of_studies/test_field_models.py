@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.fusion.benchmark.body_velocity import Poses, body_velocity, heading
-from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.body_velocity import Poses, body_velocity, heading
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field import kinematic
 from tests.studies.twin_field.field_run import speed_noise
 from tests.studies.twin_field.fitting import residuals

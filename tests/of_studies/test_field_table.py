@@ -16,9 +16,9 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark import checkpoints as parts
-from terrafusion.fusion.benchmark import field_logs
 from terrafusion.fusion.benchmark.field_logs import Refusal
 from terrafusion.twin.simulate import simulate
+from tests.studies import field_runs
 from tests.studies.field_table import table as field_table
 from tests.studies.field_table.page import markdown, plot_lines, write
 from tests.studies.field_table.summary import (
@@ -255,7 +255,7 @@ def test_a_refusal_does_not_tell_where_a_log_lies(
     def opened(log: str) -> list[Recording]:
         raise DataError("holds NaN", file=file, channel="speed", remedy="mend it")
 
-    monkeypatch.setattr(field_logs, "open_recordings", opened)
+    monkeypatch.setattr(field_runs, "open_recordings", opened)
     _, (refusal,) = run_task(Task("set/one", "fixed", 1, 1))
     assert isinstance(refusal, Refusal)
     assert refusal.line == told

@@ -15,8 +15,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from terrafusion.fusion.benchmark.field_logs import catalogued
 from terrafusion.fusion.estimator.drift_watch import DriftWatch
+from tests.studies.field_runs import catalogued
 from tests.studies.opponents import ours
 from tests.studies.opponents.drives import Drive, drives_of, longest, vehicle_of
 from tests.studies.opponents.protocol import streams_of

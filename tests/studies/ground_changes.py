@@ -8,8 +8,8 @@ on. The limit of the alarm was chosen on routes with seeds 0 to 9; these have ot
 
 from __future__ import annotations
 
-from terrafusion.fusion.benchmark.field_logs import catalogued
 from terrafusion.fusion.training.cross_validation import LabelledRun, cross_validate, open_runs
+from tests.studies.field_runs import catalogued
 from tests.studies.ground_classifier.change_detection import changes_seen
 
 FIRST_SEED = 1000

@@ -20,7 +20,6 @@ import numpy as np
 from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.fusion.benchmark.field_logs import read_runs
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.memory import GroundMemory
@@ -28,6 +27,7 @@ from terrafusion.fusion.metrics.health import rolled_until_m
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.choose import choose_vehicle
+from tests.studies.field_runs import read_runs
 from tests.studies.parts import TaskWorkers, add_options, answers
 
 SPLIT = Path(__file__).with_name("ground_split.yaml")

@@ -13,12 +13,13 @@ from statistics import median
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from terrafusion.fusion.benchmark.field_logs import outages_of, read_runs
+from terrafusion.fusion.benchmark.field_logs import outages_of
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, until
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.reports.plots import style
 from tests.studies.axes import format_axes
+from tests.studies.field_runs import read_runs
 
 LOG = "norlab_drive/ice_2024_7_30_16h30s21/windows"
 OUTAGE_S, SEED = 30.0, 1

@@ -12,7 +12,7 @@ import pytest
 from terrafusion.datasets.core.channels import Imu, Terrain, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark import field_logs
-from terrafusion.fusion.benchmark.field_logs import check_log, each_run, ground_of, outages_of, reference_of
+from terrafusion.fusion.benchmark.field_logs import FieldLog, ground_of, outages_of, reference_of, runs_of
 from terrafusion.fusion.benchmark.outage_plan import (
     aided_by_truth,
 )
@@ -64,20 +64,21 @@ def test_a_log_is_read_once_for_methods_that_follow_each_other(
     read: list[str] = []
     bare = dataclasses.replace(drive(seconds=20.0).recording, wheels=None)
 
-    def opened(log: str) -> list[Recording]:
+    def read_again(log: str) -> list[Recording]:
         read.append(log)
         return [bare]
 
-    def checked(name: str, number: int, recording: Recording) -> list[str]:
-        check_log(recording)
-        return [name]
-
-    field_logs.read_runs.cache_clear()
-    monkeypatch.setattr(field_logs, "open_recordings", opened)
+    field_logs.opened.cache_clear()
+    monkeypatch.setattr(field_logs, "open_recordings", read_again)
     for log in ("one", "one", "two"):
-        (refusal,) = each_run(log, checked)
+        (refusal,) = runs_of(FieldLog(log, 1))
         assert isinstance(refusal, field_logs.Refusal)
         assert refusal.log == log
         assert "no wheels" in refusal.why
     assert read == ["one", "two"]
-    field_logs.read_runs.cache_clear()
+    field_logs.opened.cache_clear()
+
+
+def test_logs_cut_into_windows_are_no_runs_of_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(field_logs, "present_recordings", lambda: ["a/raw", "a/windows", "b/windows", "c/s1"])
+    assert [log.name for log in field_logs.present_logs(1)] == ["a/raw", "c/s1"]

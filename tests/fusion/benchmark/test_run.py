@@ -120,12 +120,12 @@ def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> N
     def fail(what: object) -> None:
         raise ValueError("from a reader or planner")
 
-    field_logs.read_runs.cache_clear()
+    field_logs.opened.cache_clear()
     monkeypatch.setattr(field_logs, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)])
     monkeypatch.setattr(*place, fail)
     _, found = run.run_job(Job(FieldLog("one", 1), ("fixed",)))
     assert found == BenchmarkResult((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
-    field_logs.read_runs.cache_clear()
+    field_logs.opened.cache_clear()
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(

@@ -32,9 +32,7 @@ from terrafusion.fusion.benchmark.checkpoints import FOLDER, log_state, read_par
 from terrafusion.fusion.benchmark.field_logs import (
     UNFORESEEN,
     Refusal,
-    catalogued,
     check_log,
-    each_run,
     ground_of,
     outages_of,
     reference_of,
@@ -46,6 +44,7 @@ from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.executors import open_workers
+from tests.studies.field_runs import catalogued, each_run
 from tests.studies.parts import TaskWorkers, add_options
 
 ONE = TaskWorkers()

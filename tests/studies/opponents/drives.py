@@ -20,10 +20,11 @@ from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers import open_recordings
-from terrafusion.fusion.benchmark.field_logs import catalogued, read_runs, reference_of
+from terrafusion.fusion.benchmark.field_logs import reference_of
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.library import is_named
 from terrafusion.twin.model.vehicle import VehicleParams
+from tests.studies.field_runs import catalogued, read_runs
 
 Array = NDArray[np.float64]
 

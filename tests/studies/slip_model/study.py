@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.fusion.benchmark.field_logs import catalogued, read_runs
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.field_runs import catalogued, read_runs
 from tests.studies.slip_model.features import LEAST_ROLLED_M, SlipWindows, windows_of
 from tests.studies.slip_model.model import SlipModel, fit
 from tests.studies.slip_model.population import drive

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark.body_velocity import Poses, body_velocity
-from terrafusion.fusion.benchmark.joined_windows import DT_S, chain_starts, joined, motion_of_chain
 from terrafusion.twin.model.vehicle import VehicleParams
+from tests.studies.body_velocity import Poses, body_velocity
+from tests.studies.joined_windows import DT_S, chain_starts, joined, motion_of_chain
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.benchmark.joined_windows import DT_S
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.field_run import FieldRun
 
 Array = NDArray[np.float64]

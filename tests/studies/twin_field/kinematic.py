@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.model.vehicle import VehicleParams
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.fitting import Bounded, fit
 from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from terrafusion.fusion.benchmark.joined_windows import DT_S
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.compare import SAME, Result
 from tests.studies.twin_field.forks import N_PAST
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL

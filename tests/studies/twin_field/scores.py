@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.bootstrap import percentile_interval
-from terrafusion.fusion.benchmark.body_velocity import heading
-from terrafusion.fusion.benchmark.joined_windows import DT_S
+from tests.studies.body_velocity import heading
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
 from tests.studies.twin_field.resampled_groups import resampled_groups
 

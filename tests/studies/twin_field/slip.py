@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.benchmark.joined_windows import DT_S
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.compare import SAME, Result
 from tests.studies.twin_field.forks import N_PAST, Forks
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL

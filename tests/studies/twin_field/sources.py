@@ -12,8 +12,9 @@ from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.field_logs import CUT, WHOLE
-from terrafusion.fusion.benchmark.joined_windows import chains_of
+from terrafusion.fusion.benchmark.field_logs import CUT
+from tests.studies.field_runs import WHOLE
+from tests.studies.joined_windows import chains_of
 from tests.studies.twin_field.field_run import FieldRun, field_run
 
 SETS = ("norlab_drive", "umich_husky", "wvu_pathfinder")

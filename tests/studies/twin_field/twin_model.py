@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.fusion.benchmark.joined_windows import DT_S
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import SoilParams
@@ -19,6 +18,7 @@ from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import delayed_inputs
+from tests.studies.joined_windows import DT_S
 from tests.studies.twin_field.fitting import Bounded, fit
 from tests.studies.twin_field.forks import N_PAST, Forks
 

@@ -19,8 +19,8 @@ from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.fusion.benchmark.body_velocity import CHUNK_S, Poses, body_velocity, heading
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from tests.studies.body_velocity import CHUNK_S, Poses, body_velocity, heading
 
 DT_S = 0.05
 JOIN_RADPS, JOIN_WHEEL_RADPS = 0.25, 1.5

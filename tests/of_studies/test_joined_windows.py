@@ -13,8 +13,8 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.joined_windows import joined_runs
 from terrafusion.twin.simulate import simulate
+from tests.studies.joined_windows import joined_runs
 
 WINDOW_S = 2.0
 
