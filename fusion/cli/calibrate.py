@@ -12,6 +12,7 @@ from terrafusion.fusion.cli.common import (
     HowRead,
     command_line,
     load_rig,
+    parse_pairs,
     progress_bar,
     read_json,
     refuse_impossible,
@@ -166,10 +167,7 @@ def parse_terrain(entries: list[str] | None) -> str | dict[str, str] | None:
         if len(entries) > 1:
             raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
         return entries[0] if entries else None
-    pairs = [entry.partition("=") for entry in entries]
-    if not all(label and soil for label, _, soil in pairs):
-        raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
-    return {label: soil for label, _, soil in pairs}
+    return parse_pairs(entries, "LABEL=SOIL; one soil for all logs stands alone", "--terrain")
 
 
 def named_soils(soils: str | dict[str, str] | None, found: Calibration) -> dict[str, str]:

@@ -16,9 +16,8 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli import common
-from terrafusion.fusion.cli.common import PROGRESS, HowRead
+from terrafusion.fusion.cli.common import PROGRESS, HowRead, Line, styled
 from terrafusion.fusion.cli.outputs import Output, check_file, parts_of
 
 PANEL = "Options of all commands"
@@ -39,7 +38,7 @@ class Result:
         vehicle: `VehicleParams` of the run, for `config.json`.
     """
 
-    lines: Sequence[str] = ()
+    lines: Sequence[str | Line] = ()
     done: str = ""
     document: Any = None
     status: int = 0
@@ -48,33 +47,19 @@ class Result:
     vehicle: Any = None
 
 
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print one line and errors.", rich_help_panel=PANEL)
-]
-Verbose = Annotated[
-    bool,
-    typer.Option(
-        "--verbose", help="Print details, all options, and where an error arose.", rich_help_panel=PANEL
-    ),
-]
-AsJson = Annotated[
-    bool,
-    typer.Option("--json", help="Print one JSON document, all else to stderr.", rich_help_panel=PANEL),
-]
-Force = Annotated[
-    bool,
-    typer.Option("--force", help="Replace what this command did not write.", rich_help_panel=PANEL),
-]
+FLAGS = {
+    "quiet": ("--quiet", "-q", "Print one line and errors."),
+    "verbose": ("--verbose", "Print details, all options, and where an error arose."),
+    "as_json": ("--json", "Print one JSON document, all else to stderr."),
+    "force": ("--force", "Replace what this command did not write."),
+}
+"""Names and help of the options that commands share."""
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """Values of the shared options that a command has."""
-
-    quiet: bool
-    verbose: bool
-    as_json: bool = False
-    force: bool = False
+def _flag(described: Sequence[str]) -> Any:
+    """The annotation of one of `FLAGS`."""
+    *names, help = described
+    return Annotated[bool, typer.Option(*names, help=help, rich_help_panel=PANEL)]
 
 
 def add_command(
@@ -98,39 +83,39 @@ def add_command(
         files: options that are further files to write, each with a word of the files it may replace.
         as_json: whether it has `--json`.
     """
-    shared = {"quiet": Quiet, "verbose": Verbose}
-    shared |= {"as_json": AsJson} if as_json else {}
-    shared |= {"force": Force} if output is not None or files else {}
+    shared = ["quiet", "verbose"]
+    shared += ["as_json"] if as_json else []
+    shared += ["force"] if output is not None or files else []
     signature, own, about = _own_options(body, output)
     how_read = next((one.name for one in signature.parameters.values() if one.annotation is HowRead), None)
 
     @functools.wraps(body)
     def command(context: typer.Context, **given: Any) -> None:
-        how = _Shared(**{word: given.pop(word) for word in shared})
-        PROGRESS.bar, PROGRESS.lines = not how.quiet, how.verbose
+        quiet, verbose, in_json, force = (given.pop(word, False) for word in FLAGS)
+        PROGRESS.bar, PROGRESS.lines = not quiet, verbose
         called = context.command_path.partition(" ")[2]
         kind = instead[1] if instead is not None and given[instead[0]] else output
         if kind is not None:
-            given["out"] = kind.place(given["out"], called, subject_of(given[next(iter(own))]), how.force)
+            given["out"] = kind.place(given["out"], called, subject_of(given[next(iter(own))]), force)
         for option, mark in (files or {}).items():
             if given[option] is not None:
-                check_file(given[option], how.force, mark)
-        if how.verbose:
+                check_file(given[option], force, mark)
+        if verbose:
             print("\n".join(f"{key} = {value}" for key, value in given.items()), file=sys.stderr)
-        with _ending_reported(given.get("out"), kind, how.verbose), _redirected(how.quiet, how.as_json):
+        with _ending_reported(given.get("out"), kind, verbose), _redirected(quiet, in_json):
             result = body(**_gathered(given, how_read))
             if kind is not None and "config.json" in kind.names:
                 from terrafusion.fusion.cli.used_config import write_config
 
                 write_config(given["out"], called, given, result.vehicle)
-        show(result, how.quiet, how.verbose, how.as_json)
+        show(result, quiet, verbose, in_json)
         if result.status:
             raise typer.Exit(result.status)
 
     command.__doc__ = about
     asked = [
-        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-        for word, kind in shared.items()
+        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_flag(FLAGS[word]))
+        for word in shared
     ]
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     everything = [context, *own.values(), *asked]
@@ -219,9 +204,9 @@ def show(result: Result, quiet: bool, verbose: bool, as_json: bool) -> None:
     """Print a result; with `as_json` its document alone is on standard output."""
     details = result.details if verbose else ()
     short = [result.short or result.done]  # with `--json`, the rest is in the document
-    lines = short if quiet or as_json else [*result.lines, *details, result.done]
+    lines: list[str | Line] = [*short] if quiet or as_json else [*result.lines, *details, result.done]
     for line in lines if lines[-1] else lines[:-1]:
-        print(printable(line), file=sys.stderr if as_json else sys.stdout)
+        print(styled(line), file=sys.stderr if as_json else sys.stdout)
     if as_json:
         print(json.dumps(result.document, indent=2, allow_nan=False))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import sys
 import time
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli.usage import SHARED
 
 if TYPE_CHECKING:
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
 
 
+Line = tuple[str, str]
+"""Style of the first word of a line, shown on a terminal only, and its text."""
 LogArgument = Annotated[
     str,
     typer.Argument(
@@ -63,15 +67,41 @@ AddressOption = Annotated[
 ]
 
 
-def parse_topics(entries: list[str] | None) -> dict[str, str]:
-    """`channel=/name` entries as a mapping; a malformed one is wrong usage (exit status 2)."""
-    topics = {}
-    for entry in entries or []:
-        channel, equals, name = entry.partition("=")
-        if not equals or not channel.strip() or not name.strip():
-            raise typer.BadParameter(f"'{entry}' is not CHANNEL=/NAME", param_hint="--topic")
-        topics[channel.strip()] = name.strip()
-    return topics
+def parse_pairs(entries: Sequence[str] | None, form: str, hint: str) -> dict[str, str]:
+    """Entries of the form `NAME=VALUE`; a malformed or repeated one is wrong usage (exit status 2)."""
+    pairs: dict[str, str] = {}
+    for entry in entries or ():
+        name, _, value = (part.strip() for part in entry.partition("="))
+        if not name or not value:
+            raise typer.BadParameter(f"'{entry}' is not {form}", param_hint=hint)
+        if name in pairs:
+            raise typer.BadParameter(f"'{name}' is given twice", param_hint=hint)
+        pairs[name] = value
+    return pairs
+
+
+def parse_topics(entries: Sequence[str] | None) -> dict[str, str]:
+    """Topics by channel."""
+    return parse_pairs(entries, "CHANNEL=/NAME", "--topic")
+
+
+def parse_point(text: str | None, form: str, hint: str) -> tuple[float, float, float] | None:
+    """Three numbers between commas, None for none; anything else is wrong usage (exit status 2)."""
+    if text is None:
+        return None
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is not {form}", param_hint=hint) from None
+    return x, y, z
+
+
+def check_mode(mode: str) -> None:
+    """Refuse an unknown `--mode` as wrong usage (exit status 2)."""
+    from terrafusion.fusion.config.estimator_config import MODES
+
+    if mode not in MODES:
+        raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
 
 
 def check_stamps(stamps: str) -> str:
@@ -149,6 +179,16 @@ class HowRead:
         return [clock_accepted(r) for r in found] if self.repair_clock else found
 
 
+def styled(line: str | Line) -> str:
+    """A line as it is printed: in colour where standard output is a terminal, controls written out."""
+    style, text = line if isinstance(line, tuple) else ("", line)
+    word, space, rest = printable(text).partition(" ")
+    if style and sys.stdout.isatty() and "NO_COLOR" not in os.environ:
+        look: dict[str, Any] = {style: True} if style in ("bold", "dim") else {"fg": style}
+        word = typer.style(word, **look)
+    return word + space + rest
+
+
 def warn_unused(log: str, recordings: Sequence[Recording]) -> None:
     """A line on standard error for each option that means nothing for the format of a log."""
     from terrafusion.datasets.readers import NOT_USED
@@ -184,6 +224,16 @@ def refuse_errors(
     findings = run_checks(recording, rig_of(recording, rig))
     _refuse(log, [finding for finding in findings if finding.code not in learned])
     return findings
+
+
+def write_log(recording: Recording, out: Path, rig: Rig | None = None) -> list[str]:
+    """Write an MCAP bag where `out` is named so, else a log folder; what ROS has no standard message for."""
+    from terrafusion.datasets.writers import write_log_folder, write_mcap
+
+    if out.suffix == ".mcap":
+        return list(write_mcap(recording, out, rig=rig, overwrite=True))
+    write_log_folder(recording, out)
+    return []
 
 
 def refuse_no_yaml(out: Path) -> None:

@@ -18,13 +18,12 @@ from terrafusion.fusion.cli.common import (
     refuse_impossible,
     rig_of,
     warn_unused,
+    write_log,
 )
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
-    from terrafusion.datasets.core.recording import Recording
-    from terrafusion.datasets.core.sensors import Rig
 
 OUTPUT = Output("A name ending in .mcap, or a folder.", LOG_FILES, mark=None)
 
@@ -70,7 +69,9 @@ def convert(
     if apply_fixes:
         recording, repaired = repair(recording, rig)
         lines += [f"repaired: {_line(finding)}" for finding in repaired]
-    unseen = _write(log, recording, rig, out)
+    if out.suffix == ".mcap":
+        refuse_impossible(log, recording)  # their latitudes would be nonsense
+    unseen = write_log(recording, out, rig)
     lines += [f"not in standard messages: {part}" for part in unseen]
     left = [one for one in run_checks(recording, rig) if apply_fixes or one.severity == "error"]
     lines += [f"{one.severity}: {_line(one)}{_why_left(one, apply_fixes)}" for one in left]
@@ -82,17 +83,6 @@ def convert(
         "repaired": [_line(one) for one in repaired], "findings": [_line(one) for one in left],
     }  # fmt: skip
     return Result(lines, f"{out}: {', '.join(f'{name} {count}' for name, count in rows.items())}", document)
-
-
-def _write(log: str, recording: Recording, rig: Rig | None, out: Path) -> list[str]:
-    """Write the log; returns what ROS has no standard message for."""
-    from terrafusion.datasets.writers import write_log_folder, write_mcap
-
-    if out.suffix != ".mcap":
-        write_log_folder(recording, out)
-        return []
-    refuse_impossible(log, recording)  # their latitudes would be nonsense
-    return list(write_mcap(recording, out, rig=rig, overwrite=True))
 
 
 def _line(finding: Finding) -> str:

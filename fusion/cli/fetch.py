@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import PROGRESS
-from terrafusion.fusion.cli.inspect_page import styled_lines
+from terrafusion.fusion.cli.common import Line, progress_bar
 
 if TYPE_CHECKING:
     from terrafusion.datasets.catalog.catalog import Catalog, CatalogFile
@@ -74,8 +70,8 @@ def _row(catalog: Catalog, name: str) -> dict[str, Any]:
     }
 
 
-def _catalog_lines(rows: list[dict[str, Any]]) -> list[str]:
-    lines: list[tuple[str, str]] = []
+def _catalog_lines(rows: list[dict[str, Any]]) -> list[Line]:
+    lines: list[Line] = []
     for row in rows:
         count = len(row["recordings"])
         about = (
@@ -85,7 +81,7 @@ def _catalog_lines(rows: list[dict[str, Any]]) -> list[str]:
         names = ", ".join(row["recordings"][:4]) + (f", ... ({count})" if count > 4 else "")
         texts = [*(row[key] for key in ("title", "holds", "citation", "homepage")), names]
         lines += [("bold", about), *(("", f"    {text}") for text in texts if text)]
-    return styled_lines(lines)
+    return lines
 
 
 def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool) -> Result:
@@ -93,7 +89,14 @@ def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool
 
     wanted = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
     done = []
-    with _bar(sum(entry.bytes for entry in wanted.values())) as advance:
+    total, done_bytes = max(sum(entry.bytes for entry in wanted.values()), 1), dict[str, int]()
+    with progress_bar("downloading") as progress:
+
+        def advance(entry: CatalogFile, received: int) -> None:
+            done_bytes[entry.file] = received
+            if progress is not None:
+                progress(sum(done_bytes.values()) / total)
+
         for got in fetch(names, to, offline=offline, progress=advance):
             done.append(got)
             advance(got.entry, got.entry.bytes)
@@ -104,24 +107,3 @@ def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool
         f"{known.name}: {known.licence}; please cite: {known.citation} ({known.homepage})" for known in sets
     ]
     return Result(cited, "", {"files": files, "licences": {s.name: s.licence for s in sets}})
-
-
-@contextmanager
-def _bar(total_bytes: int) -> Iterator[Callable[[CatalogFile, int], None]]:
-    """A progress bar over all bytes on a terminal; silent in a pipe."""
-    if not sys.stderr.isatty():
-        yield lambda entry, done: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-
-    bytes_of: dict[str, int] = {}
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not PROGRESS.bar) as bar:
-        task = bar.add_task("", total=total_bytes)
-
-        def advance(entry: CatalogFile, done: int) -> None:
-            bytes_of[entry.file] = done
-            bar.update(task, completed=sum(bytes_of.values()), description=entry.file)
-
-        yield advance

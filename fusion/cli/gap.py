@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.datasets.core.sensors import Rig
     from terrafusion.fusion.benchmark.estimator_gap import Compared
-    from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
 OUTPUT = Output(
     "Folder for diagnosis.json and report.html.",
@@ -106,7 +105,11 @@ def gap(
             effects=None if effects is None else split(effects), significance=significance, source=source,
             seed=seed, progress=progress,
         )  # fmt: skip
-    scores = _estimator_gap(found, judged, normal, vehicle, seed) if judge else None
+    scores = None
+    if judge:
+        from terrafusion.fusion.benchmark.estimator_gap import estimator_gap, estimator_scorer
+
+        scores = estimator_gap(found, judged, normal, estimator_scorer(vehicle), seed)
     compared = [] if scores is None else [_line(score) for score in scores[0]]
     write_diagnosis(out, found, {"command": command_line()}, scores)
     changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
@@ -127,14 +130,6 @@ def _opened_by_name(names: list[str], how: HowRead, rig: Rig | None) -> list[Rec
         called = [name] if len(logs) == 1 else [f"{name}#{i}" for i in range(len(logs))]
         found += [dataclasses.replace(log, name=own) for log, own in zip(logs, called, strict=True)]
     return found
-
-
-def _estimator_gap(
-    found: GapDiagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
-) -> tuple[list[Compared], list[str]]:
-    from terrafusion.fusion.benchmark.estimator_gap import estimator_gap, estimator_scorer
-
-    return estimator_gap(found, runs, references, estimator_scorer(vehicle), seed)
 
 
 def _line(compared: Compared) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from terrafusion.fusion.cli.inspect_page import Line, clock_table, entry, measured_texts, print_lines
+from terrafusion.fusion.cli.common import Line
+from terrafusion.fusion.cli.inspect_page import clock_table, entry, measured_texts, print_lines
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording

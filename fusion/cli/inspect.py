@@ -46,17 +46,16 @@ def inspect(
     Args:
         report (FILE.html): Also write this as a page.
     """
-    from terrafusion.fusion.cli.inspect_page import contents_lines, page_lines, styled_lines
+    from terrafusion.fusion.cli.inspect_page import contents_lines, page_lines
 
     page = inspected(log, vehicle, topic, stamps, columns)
-    lines = list(page_lines(page))
     if report is not None:
         from terrafusion.fusion.reports.inspect import write_inspection
 
         write_inspection(report, page, [text for _, text in contents_lines(page)], command_line())
     done = "" if report is None else f"report: {report}"
     failed = any(finding["severity"] == "error" for finding in page.get("findings", ()))
-    return Result(styled_lines(lines), done, page, int(failed), short=_found(page))
+    return Result(list(page_lines(page)), done, page, int(failed), short=_found(page))
 
 
 def _found(page: dict[str, Any]) -> str:

@@ -1,39 +1,25 @@
 """The page of `terrafusion inspect` as lines of text, at most 100 columns wide.
 
-It is made of the data that `--json` prints. A line is a text with the style of its first word; styles
-show on a terminal only.
+It is made of the data that `--json` prints.
 """
 
 import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from terrafusion.datasets.core.tables import text_table
+from terrafusion.fusion.cli.common import Line, styled
+
 WIDTH = 100
 INDENT = 10
 MOST_WORDS = 12
 GLUE = "\N{NO-BREAK SPACE}"
-Line = tuple[str, str]
 
 
 def print_lines(lines: Iterable[Line]) -> None:
     """Print, in colour where standard output is a terminal."""
-    print("\n".join(styled_lines(lines)))
-
-
-def styled_lines(lines: Iterable[Line]) -> list[str]:
-    """The lines, in colour where standard output is a terminal."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console, styled = Console(highlight=False, soft_wrap=True), []
-    for style, line in lines:
-        text = Text(line)
-        if style:
-            text.stylize(style, 0, len(line.split(" ", 1)[0]))
-        with console.capture() as captured:
-            console.print(text)
-        styled.append(captured.get().removesuffix("\n"))
-    return styled
+    for line in lines:
+        print(styled(line))
 
 
 def page_lines(page: dict[str, Any]) -> Iterator[Line]:
@@ -82,8 +68,15 @@ def _channels(channels: dict[str, Any]) -> Iterator[Line]:
 def clock_table(channels: dict[str, Any], head: str = "channel") -> Iterator[Line]:
     """Samples, rates and gaps of channels (or of topics), a row each."""
     pooled = any("recordings" in c for c in channels.values())
-    heads = [head, "samples", "rate Hz", "recordings" if pooled else "span s", "gaps", "longest s"]
-    rows = [heads]
+    heads = [
+        head.ljust(INDENT - 2),
+        "samples",
+        "rate Hz",
+        "recordings" if pooled else "span s",
+        "gaps",
+        "longest s",
+    ]
+    rows = []
     for name, c in channels.items():
         rate, gap = c["rate_hz"], c["longest_gap_s"]
         sampled = name != "terrain"  # labels are irregular
@@ -95,12 +88,9 @@ def clock_table(channels: dict[str, Any], head: str = "channel") -> Iterator[Lin
             str(c["gaps"]) if sampled else "-",
             f"{gap:.2g}" if c["gaps"] and sampled else "-",
         ])  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
     yield "", ""
-    for number, row in enumerate(rows):
-        cells = [row[0].ljust(max(widths[0], INDENT - 2))]
-        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-        yield ("bold" if number == 0 else ""), "  ".join(cells).rstrip()
+    for number, line in enumerate(text_table(heads, rows, right=range(1, len(heads)))):
+        yield ("bold" if number == 0 else ""), line
 
 
 def _ranges(channel: dict[str, Any]) -> str:

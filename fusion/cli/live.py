@@ -14,8 +14,10 @@ from terrafusion.fusion.cli.common import (
     StampsOption,
     TopicOption,
     VehicleOption,
+    check_mode,
     check_stamps,
     load_rig,
+    parse_point,
     parse_topics,
 )
 from terrafusion.fusion.cli.usage import refuse_options
@@ -74,13 +76,12 @@ def live(
         seconds: Stop after so long; else Ctrl-C.
         foxglove (PORT): Show it in Foxglove at ws://localhost:PORT.
     """
-    from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.live.node import LiveOptions
 
-    if mode not in MODES:
-        raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
+    check_mode(mode)
+    origin = parse_point(datum, "LAT,LON,HEIGHT", "--datum")
     options = LiveOptions(
-        vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=_datum(datum),
+        vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=origin,
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
     )  # fmt: skip
     of_a_robot = {
@@ -151,16 +152,6 @@ def _domain(domain: int | None) -> int:
     if not text.isdecimal():
         raise typer.BadParameter(f"ROS_DOMAIN_ID is '{text}', which is no number", param_hint="--domain")
     return int(text)
-
-
-def _datum(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        latitude, longitude, height_m = map(float, text.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"'{text}' is not LAT,LON,HEIGHT", param_hint="--datum") from None
-    return latitude, longitude, height_m
 
 
 def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:

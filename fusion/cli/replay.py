@@ -14,6 +14,7 @@ from terrafusion.fusion.cli.common import (
     HowRead,
     LogArgument,
     VehicleOption,
+    check_mode,
     command_line,
     load_rig,
     progress_bar,
@@ -128,11 +129,9 @@ def _outage(text: str) -> Outage:
 
 def _check_usage(mode: str, rerun: Path | None) -> None:
     """Refuse an unknown mode, and a file for Rerun where that is not installed."""
-    from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.reports.rerun_log import require_rerun
 
-    if mode not in MODES:
-        raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
+    check_mode(mode)
     if rerun is not None:
         require_rerun()
 

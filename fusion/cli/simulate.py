@@ -10,10 +10,10 @@ import typer
 
 from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import parse_pairs, parse_point, write_log
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.core.recording import Recording
     from terrafusion.twin.analysis.summary import RunSummary
     from terrafusion.twin.simulate import SimulatedRun
 
@@ -78,23 +78,13 @@ def simulate(
         slope_deg=slope_deg,
         cross_slope_deg=cross_slope_deg,
         payload_kg=payload_kg,
-        payload_at_m=None if payload_at is None else _place(payload_at),
+        payload_at_m=parse_point(payload_at, "X,Y,Z in metres", "--payload-at"),
         seed=seed,
         noiseless=noiseless,
         effects=effect_values(effect or []),
     )
-    _write(run.recording, out)
+    write_log(run.recording, out)
     return Result(summary_lines(run), f"written to {out}", document(run, out))
-
-
-def _write(recording: Recording, out: Path) -> None:
-    """Write the log as an MCAP bag where `out` is named so, else as a log folder."""
-    from terrafusion.datasets.writers import write_log_folder, write_mcap
-
-    if out.suffix == ".mcap":
-        write_mcap(recording, out, overwrite=True)
-    else:
-        write_log_folder(recording, out)
 
 
 def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
@@ -110,14 +100,6 @@ def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
         "out": str(out), "description": recording.description, "samples": rows,
         "notes": list(recording.notes), "summary": made,
     }  # fmt: skip
-
-
-def _place(text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(word) for word in text.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"'{text}' is not X,Y,Z in metres", param_hint="--payload-at") from None
-    return x, y, z
 
 
 def summary_lines(run: SimulatedRun) -> list[str]:
@@ -166,17 +148,11 @@ def _immobilised_line(summary: RunSummary) -> str:
 def effect_values(words: list[str]) -> dict[str, float]:
     """Values by name of `NAME=VALUE` words; names and ranges are checked by the twin."""
     values: dict[str, float] = {}
-    for word in words:
-        name, equals, number = word.partition("=")
+    for name, number in parse_pairs(words, "NAME=VALUE", "--effect").items():
         try:
-            value = float(number)
+            values[name] = float(number)
         except ValueError:
-            equals = ""
-        if not equals:
-            raise typer.BadParameter(f"'{word}' is not NAME=VALUE", param_hint="--effect")
-        if name in values:
-            raise typer.BadParameter(f"'{name}' is given twice", param_hint="--effect")
-        values[name] = value
+            raise typer.BadParameter(f"'{name}={number}' is not NAME=VALUE", param_hint="--effect") from None
     return values
 
 

@@ -9,7 +9,7 @@ import time
 import pytest
 import typer
 
-from terrafusion.fusion.cli.command import Result, add_command
+from terrafusion.fusion.cli.command import Result, add_command, show
 from terrafusion.fusion.cli.main import app
 
 
@@ -114,3 +114,12 @@ def test_every_option_has_a_help() -> None:
     commands += [inner for one in commands for inner in getattr(one, "commands", {}).values()]
     missing = [f"{c.name} {p.name}" for c in commands for p in c.params if not p.help]
     assert not missing
+
+
+def test_a_terminal_shows_styles_and_no_controls_of_a_log(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    show(Result([("bold", "drive of a log"), ("", "\x1b[31mred")]), quiet=False, verbose=False, as_json=False)
+    assert capsys.readouterr().out == "\x1b[1mdrive\x1b[0m of a log\n\\x1b[31mred\n"
