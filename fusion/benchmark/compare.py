@@ -22,6 +22,8 @@ from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, ORACLE
 from terrafusion.fusion.benchmark.run_score import RunScore
 
 Interval = tuple[float, float]
+Errors = dict[str, dict[str, dict[str, float]]]
+"""Method -> unit -> run -> error in m, infinite for a failed replay."""
 
 RESAMPLES = 4000
 SEED = 0
@@ -88,14 +90,13 @@ def groups_of(rows: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]
 
 def contrasts(rows: Sequence[RunScore], baseline: str = BASELINE) -> list[Contrast]:
     """Every method against `baseline`, group by group."""
-    out = []
-    for (family, plant), group in groups_of(rows).items():
-        errors = errors_by_unit(group)
-        for method in dict.fromkeys(row.method for row in group):
-            found = _contrast(errors, method, baseline)
-            if found is not None:
-                out.append(Contrast(family, plant, method, baseline, *found))
-    return out
+    groups = groups_of(rows).items()
+    found = (
+        _contrast(key, errors_by_unit(group), method, baseline)
+        for key, group in groups
+        for method in dict.fromkeys(row.method for row in group)
+    )
+    return [contrast for contrast in found if contrast is not None]
 
 
 def shares(rows: Sequence[RunScore]) -> list[GainShare]:
@@ -103,9 +104,9 @@ def shares(rows: Sequence[RunScore]) -> list[GainShare]:
     return [GainShare(*key, *_share(errors_by_unit(group))) for key, group in groups_of(rows).items()]
 
 
-def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, float]]]:
-    """Method -> unit -> run -> error in m, infinite for a failed replay; runs without error are left out."""
-    out: dict[str, dict[str, dict[str, float]]] = {}
+def errors_by_unit(rows: Sequence[RunScore]) -> Errors:
+    """The errors of runs; those without one are left out."""
+    out: Errors = {}
     for row in rows:
         broken = row.failed or (row.diverged and row.error_m is None)
         error = math.inf if broken else row.error_m
@@ -115,9 +116,7 @@ def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, fl
     return out
 
 
-def log_ratios(
-    errors: dict[str, dict[str, dict[str, float]]], method: str, baseline: str
-) -> dict[str, float]:
+def log_ratios(errors: Errors, method: str, baseline: str) -> dict[str, float]:
     """Unit -> logarithm of the ratio: median over the common runs in which the baseline did not fail."""
     out = {}
     for unit, own in errors.get(method, {}).items():
@@ -161,23 +160,22 @@ def _sign_test_rank(n: int) -> int:
     return k
 
 
-def _contrast(
-    errors: dict[str, dict[str, dict[str, float]]], method: str, baseline: str
-) -> tuple[int, float, float, float, Interval | None, int, int] | None:
+def _contrast(group: tuple[str, str], errors: Errors, method: str, baseline: str) -> Contrast | None:
     logs = log_ratios(errors, method, baseline)
     if not logs:
         return None
     own, other = ([float(np.median([*errors[a][u].values()])) for u in logs] for a in (method, baseline))
     middle, interval = median_interval(list(logs.values()))
     ratios = np.exp(list(logs.values()))
-    return (
-        len(logs), float(np.median(own)), float(np.median(other)), float(np.exp(middle)),
+    return Contrast(
+        *group, method, baseline, len(logs), float(np.median(own)), float(np.median(other)),
+        float(np.exp(middle)),
         None if interval is None else (float(np.exp(interval[0])), float(np.exp(interval[1]))),
         int((ratios < 1.0 - EVEN).sum()), int((ratios > 1.0 + EVEN).sum()),
     )  # fmt: skip
 
 
-def _share(errors: dict[str, dict[str, dict[str, float]]]) -> tuple[float | None, Interval | None]:
+def _share(errors: Errors) -> tuple[float | None, Interval | None]:
     own, best = (log_ratios(errors, method, BASELINE) for method in (ADAPTIVE, ORACLE))
     units = [unit for unit in own if unit in best]
     if not units:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from terrafusion.fusion.benchmark.compare import (
     Contrast,
-    GainShare,
     Interval,
     contrasts,
     median_interval,
@@ -70,7 +69,11 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
         out += [
             _ratio("G1", 0.60, against_fixed, *at, ADAPTIVE),
             _ratio("G1", 0.75, against_innovation, *at, ADAPTIVE),
-            _oracle_share(shares(rows), plant),
+            *(
+                Target("G1", f"mixed, {plant}: share of the oracle's gain", 0.70, False, s.share, s.interval)
+                for s in shares(rows)
+                if (s.family, s.plant) == at
+            ),
             _ratio("G2", 1.10, against_fixed, *at, "shuffled"),
         ]
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "firm"):
@@ -119,19 +122,10 @@ def _ratio(
     return Target(name, what, limit, True, None, None)
 
 
-def _oracle_share(found: Sequence[GainShare], plant: str) -> Target:
-    what = f"mixed, {plant}: share of the oracle's gain"
-    for share in found:
-        if (share.family, share.plant) == ("mixed", plant):
-            return Target("G1", what, 0.70, False, share.share, share.interval)
-    return Target("G1", what, 0.70, False, None, None)
-
-
 def _drift(rows: Sequence[RunScore], family: str, plant: str, limit: float) -> Target:
     what = f"{family}, {plant}: drift of {ADAPTIVE} in {LONG_S:g} s, % of the distance"
     own = [row for row in rows if (row.family, row.plant, row.method) == (family, plant, ADAPTIVE)]
     percent = [row.percent for row in own if row.outage_s == LONG_S and row.percent is not None]
     percent += [math.inf for row in own if row.failed]
-    if not percent:
-        return Target("G5", what, limit, True, None, None, "%")
-    return Target("G5", what, limit, True, *median_interval(percent), "%")
+    found, interval = median_interval(percent) if percent else (None, None)
+    return Target("G5", what, limit, True, found, interval, "%")

@@ -42,21 +42,15 @@ class OutageBaseline:
 
 @dataclass(frozen=True, eq=False)
 class Baselines:
-    """Root mean square position errors, m, comparable with `Scores.ate_m`; None where not scored.
-
-    `dead_reckoning_error_m`, `gnss_error_m` (M,) are the errors at the times of `Scores.errors`.
-    """
+    """Root mean square position errors, m, comparable with `Scores.ate_m`; None where not scored."""
 
     dead_reckoning_m: float | None = None
     gnss_m: float | None = None
     outages: tuple[OutageBaseline, ...] = ()
-    dead_reckoning_error_m: Array | None = None
-    gnss_error_m: Array | None = None
 
     def record(self) -> dict[str, Any]:
         """For `metrics.json`."""
-        outages = [dataclasses.asdict(outage) for outage in self.outages]
-        return {"dead_reckoning_m": self.dead_reckoning_m, "gnss_m": self.gnss_m, "outages": outages}
+        return dataclasses.asdict(self) | {"outages": [dataclasses.asdict(one) for one in self.outages]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +110,7 @@ def baselines(
             if receiver is not None:
                 ends[1] = finite(receiver[rows[-1]])
         found.append(OutageBaseline(outage.start_s, *ends))
-    return Baselines(rms(reckoned), rms(receiver), tuple(found), reckoned, receiver)
+    return Baselines(rms(reckoned), rms(receiver), tuple(found))
 
 
 def dead_reckoning(recording: Recording, wheel_radius_m: float, track_m: float) -> ReckonedPath | None:

@@ -30,7 +30,6 @@ from terrafusion.fusion.metrics.consistency import (
     Consistency,
     by_terrain,
     ground_at,
-    over_time,
     whitened_series,
 )
 from terrafusion.fusion.metrics.error_series import (
@@ -109,7 +108,7 @@ class Scores:
     """All scores of one run; None without a reference.
 
     `errors` are the underlying series, `notes` describe alignment and exclusions. `consistency` holds NEES
-    and NIS of the whole run and by terrain, `consistency_over_time` the same in windows.
+    and NIS of the whole run and by terrain.
     """
 
     against: str | None
@@ -123,7 +122,6 @@ class Scores:
     notes: tuple[str, ...] = ()
     errors: Errors | None = field(default=None, repr=False)
     consistency: tuple[Consistency, ...] = ()
-    consistency_over_time: tuple[Consistency, ...] = field(default=(), repr=False)
 
 
 def parse_outage(text: str) -> Outage:
@@ -193,7 +191,6 @@ def score(
         consistency=tuple(
             row for one in series for row in by_terrain(one, ground_at(recording, known, one.t_ns), start_ns)
         ),
-        consistency_over_time=tuple(row for one in series for row in over_time(one, start_ns)),
     )
 
 
@@ -247,12 +244,13 @@ def _outage(outage: Outage, estimate: Estimate, errors: Errors | None, start_ns:
     inside = outage.covers(path.t_ns, start_ns)
     moved = travelled_m(path.position_m[inside])
     distance = float(moved[-1]) if len(moved) else 0.0
+    nothing = OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
     if errors is None or not np.isfinite(errors.reference_m).any():
-        return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
+        return nothing
     rows = outage.scored(errors, int(path.t_ns[-1]), start_ns)
     error = errors.distance_m()[rows]
     if not len(error):
-        return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
+        return nothing
     if len(error) > 1:
         distance = float(travelled_m(errors.reference_m[rows], errors.min_step_m)[-1])
     end = float(error[-1])

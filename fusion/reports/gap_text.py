@@ -37,10 +37,9 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
 
 def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:
     """Sentences by title, none without any; at most so many places, explained effects and channels."""
-    next_run = [] if d.next_run is None else [_next(d)]
     found = {
         "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most),
-        "Next": [*_drives(d), *next_run, *_too_few(d)], "Load": _load(d, corrected),
+        "Next": _next(d), "Load": _load(corrected) if d.verdict.named else [],
     }  # fmt: skip
     return {title: sentences for title, sentences in found.items() if sentences}
 
@@ -208,35 +207,28 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
     return [how, "; ".join(parts)]
 
 
-def _drives(d: GapDiagnosis) -> list[str]:
-    if d.drives is None or not d.drives.limits():
-        return []
-    return [
-        f"Your drives differ from your references (these cover {percent(d.drives.covered)} of the time) in: "
-        f"{'; '.join(d.drives.missing)}. Make these references and diagnose again."
-    ]
+def _next(d: GapDiagnosis) -> list[str]:
+    lines = []
+    if d.drives is not None and d.drives.limits():
+        covered, missing = percent(d.drives.covered), "; ".join(d.drives.missing)
+        lines.append(
+            f"Your drives differ from your references (these cover {covered} of the time) in: "
+            f"{missing}. Make these references and diagnose again."
+        )
+    if d.next_run is not None:
+        what = d.next_run.scenario
+        lines.append(f"{what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}")
+    if d.uncalibrated:
+        lines.append(
+            "drive more references: there are too few to calibrate the test, and twin replicates stand in"
+        )
+    return lines
 
 
-def _next(d: GapDiagnosis) -> str:
-    assert d.next_run is not None
-    what = d.next_run.scenario
-    return f"{what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}"
-
-
-def _too_few(d: GapDiagnosis) -> list[str]:
-    if not d.uncalibrated:
-        return []
-    return ["drive more references: there are too few to calibrate the test, and twin replicates stand in"]
-
-
-def _load(d: GapDiagnosis, corrected: Path | None) -> list[str]:
-    if corrected is not None and d.verdict.named:
+def _load(corrected: Path | None) -> list[str]:
+    if corrected is not None:
         return [f"terrafusion gap RUN... --vehicle {corrected} judges further runs with it in the twin"]
-    return (
-        ["--write-vehicle FILE writes the vehicle file with it; load it with --vehicle FILE"]
-        if (d.verdict.named)
-        else []
-    )
+    return ["--write-vehicle FILE writes the vehicle file with it; load it with --vehicle FILE"]
 
 
 @functools.cache

@@ -148,7 +148,9 @@ def test_a_detectors_terrain_channel_is_not_taken_for_the_truth(drive):
 
 def test_windows_cover_the_drive_and_show_when_it_went_wrong(drive):
     d = drive(turn_radps=0.0, offset_m=(0.1, 0.1), drift_mps=0.05, drift_from_s=60.0)
-    rows = [r for r in score(d.estimate, d.recording).consistency_over_time if r.quantity == "position"]
+    errors = score(d.estimate, d.recording).errors
+    assert errors is not None
+    rows = c.over_time(c.position(errors), d.recording.start_ns)
     assert [round(row.start_s) for row in rows] == [0, 20, 40, 60, 80, 100, 120]
     assert sum(row.samples for row in rows) == 1201
     assert [row.mean for row in rows[:3]] == pytest.approx([1.0] * 3)
