@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.robot import DRIVES, KnownNumber, RobotFile
-from terrafusion.fusion.init.draft import raw_number
+from terrafusion.fusion.outputs.robot_file import raw_number
 
 SOURCES = ("measured", "data_sheet")
 """How an answer may be known; the first without a word."""
@@ -34,18 +34,6 @@ class Answers:
     topics: dict[str, str] = field(default_factory=dict)
 
 
-def parse_drive(text: str) -> str:
-    """One of the drives.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    word = text.strip()
-    if word not in DRIVES:
-        raise ConfigError(f"the drive is '{word}'", remedy=f"give one of {', '.join(DRIVES)}")
-    return word
-
-
 def parse(text: str, name: str) -> str | KnownNumber:
     """An answer by the name of its field.
 
@@ -53,7 +41,9 @@ def parse(text: str, name: str) -> str | KnownNumber:
         ConfigError: it is malformed or out of range.
     """
     if name == "drive":
-        return parse_drive(text)
+        if text.strip() not in DRIVES:
+            raise ConfigError(f"the drive is '{text.strip()}'", remedy=f"give one of {', '.join(DRIVES)}")
+        return text.strip()
     number = parse_number(text, name, 3 if name in POINTS else 1)
     structure(RobotFile, {"robot": {name: raw_number(number)}}, file=f"'{text}'")
     return number

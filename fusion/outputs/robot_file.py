@@ -1,7 +1,8 @@
-"""Writes a vehicle file of the short form with the numbers that `sensor_calibration` found."""
+"""Vehicle files of the short form, such as one with the numbers that `sensor_calibration` found."""
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import vehicle_names
 from terrafusion.twin.model.vehicle_file import is_short
 
+COMMENT_COLUMN = 66
 GEOMETRY = ("wheel_radius_m", "track_m", "wheelbase_m", "imu_m")
 """Geometry that logs report, by its name in both `Overrides` and the file."""
 
@@ -35,12 +37,11 @@ def write_robot(path: Path, found: SensorCalibration) -> Path:
     for name in GEOMETRY:
         value = getattr(found.overrides, name)
         if value is not None and name not in robot:
-            robot[name] = _entry(KnownNumber(value, "assumed"))
+            robot[name] = raw_number(KnownNumber(value, "assumed"))
     for name, number in vars(found.known()).items():
         if number is not None:
-            robot[name] = _entry(number)
-    structure(RobotFile, {"robot": robot}, file=path)
-    return _write(path, robot)
+            robot[name] = raw_number(number)
+    return write_section(path, robot, {})
 
 
 def _before(path: Path, vehicle: str) -> dict[str, Any]:
@@ -65,18 +66,30 @@ def seen_from(path: Path, other: Path) -> str:
     return Path(os.path.relpath(other.resolve(), path.resolve().parent)).as_posix()
 
 
-def _entry(number: KnownNumber) -> dict[str, Any]:
-    """A number as it stands in the file."""
-    entry = {key: value for key, value in dataclasses.asdict(number).items() if value not in (None, ())}
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in entry.items()}
+def raw_number(number: KnownNumber) -> dict[str, Any]:
+    """A number as it stands in the file, without what it leaves open."""
+    entries = dataclasses.asdict(number).items()
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in entries if v not in (None, ())}
 
 
-def _write(path: Path, robot: dict[str, Any]) -> Path:
+def write_section(path: Path, robot: Mapping[str, Any], comments: Mapping[str, str], head: str = "") -> Path:
+    """Write the section `robot`, an entry a line with its comment, below a comment at the head.
+
+    Raises:
+        ConfigError: a number is out of range.
+        TerrafusionError: the file cannot be written.
+    """
     from ruamel.yaml.comments import CommentedMap
 
-    section = CommentedMap(robot)
+    structure(RobotFile, {"robot": dict(robot)}, file=path)
+    section = CommentedMap()
     for name, entry in robot.items():
-        if isinstance(entry, dict):  # a number a line
-            section[name] = CommentedMap(entry)
+        section[name] = CommentedMap(entry) if isinstance(entry, dict) else entry
+        if isinstance(entry, dict):
             section[name].fa.set_flow_style()
-    return dump_yaml(path, {"robot": section}, width=1000)
+        if name in comments:
+            section.yaml_add_eol_comment(" ".join(comments[name].split()), name, column=COMMENT_COLUMN)
+    content = CommentedMap(robot=section)
+    if head:
+        content.yaml_set_start_comment(head)
+    return dump_yaml(path, content, width=1000)

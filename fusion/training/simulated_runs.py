@@ -18,6 +18,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.scratch import scratch_folder
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -75,8 +76,6 @@ class Condition:
 
 def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path:
     """A soil file in `folder`: the library's soil scattered by `SOIL_SCATTER` inside its valid ranges."""
-    from ruamel.yaml import YAML
-
     raw = copy.deepcopy(read_named("soils", terrain, kind="terrain")[0])
     for section, ranges in SOIL_SCATTER.items():
         for key, share in ranges.items():
@@ -84,10 +83,7 @@ def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path
             drawn = entry["value"] * float(rng.uniform(1.0 - share, 1.0 + share))
             low, high = entry.get("valid", (drawn, drawn))
             entry["value"] = min(max(drawn, low), high)
-    path = folder / f"{terrain}.yaml"
-    with path.open("w", encoding="utf-8") as out:
-        YAML(typ="safe", pure=True).dump(raw, out)
-    return path
+    return dump_yaml(folder / f"{terrain}.yaml", raw)
 
 
 @dataclass(frozen=True)

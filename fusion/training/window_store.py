@@ -4,11 +4,18 @@ import contextlib
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from terrafusion.datasets.core.files import check_folder, write_atomically
 from terrafusion.fusion.terrain.features import Window
+
+NUMBERS = (
+    "dt_s", "wheel_speed_mps", "wheel_speed_rate_mps2", "speed_mps", "yaw_rate_wheels_radps",
+    "yaw_rate_gyro_radps", "slip", "slip_sigma",
+)  # fmt: skip
+"""Fields of a window that are single numbers; NaN stands for None."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,7 @@ class WindowStore:
             TerrafusionError: the folder cannot be written.
         """
         check_folder(self.folder)
-        numbers = [[np.nan if value is None else value for value in _numbers(w)] for w in windows]
+        numbers = [[np.nan if (x := getattr(w, name)) is None else x for name in NUMBERS] for w in windows]
         imu = [np.column_stack([w.imu_t_s, w.gyro_radps, w.accel_mps2]) for w in windows]
         counts = np.array([len(samples) for samples in imu])
         table, state = np.array(numbers, dtype=float), np.array(self.state)
@@ -63,18 +70,8 @@ class WindowStore:
         return self.folder / f"run-{number:05d}.npz"
 
 
-def _numbers(w: Window) -> list[float | None]:
-    return [
-        w.dt_s, w.wheel_speed_mps, w.wheel_speed_rate_mps2, w.speed_mps, w.yaw_rate_wheels_radps,
-        w.yaw_rate_gyro_radps, w.slip, w.slip_sigma,
-    ]  # fmt: skip
-
-
 def _window(row: np.ndarray, imu: np.ndarray) -> Window:
-    dt, wheel, rate, speed, yaw_wheels, yaw_gyro, slip, sigma = row.tolist()
-    known = not np.isnan(slip)
-    return Window(
-        dt_s=dt, imu_t_s=imu[:, 0], gyro_radps=imu[:, 1:4], accel_mps2=imu[:, 4:7], wheel_speed_mps=wheel,
-        wheel_speed_rate_mps2=rate, speed_mps=speed, yaw_rate_wheels_radps=yaw_wheels,
-        yaw_rate_gyro_radps=yaw_gyro, slip=slip if known else None, slip_sigma=sigma if known else None,
-    )  # fmt: skip
+    known: dict[str, Any] = {
+        name: None if np.isnan(x) else x for name, x in zip(NUMBERS, row.tolist(), strict=True)
+    }
+    return Window(imu_t_s=imu[:, 0], gyro_radps=imu[:, 1:4], accel_mps2=imu[:, 4:7], **known)

@@ -22,7 +22,8 @@ from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import (
-    Canopy,
+    CanopyInterval,
+    CanopyStretch,
     DriveSegment,
     Interval,
     RouteLeg,
@@ -181,7 +182,7 @@ def test_a_scenario_file_takes_every_option(tmp_path) -> None:
         (0.1, 0.0, 0.3),
     )
     assert scenario.gnss_outages == (Interval(4.0, 2.0), Stretch(10.0, 2.0))
-    assert scenario.canopy == (Canopy(Stretch(2.0, 3.0), 0.5), Canopy(Interval(15.0, 2.0), 1.0))
+    assert scenario.canopy == (CanopyStretch(2.0, 3.0, 0.5), CanopyInterval(15.0, 2.0, 1.0))
     setup = set_up(scenario)
     assert setup.vehicle.body.mass_kg == 52.0
     assert set_up(scenario, payload_kg=0.0).vehicle.body.mass_kg == 32.0

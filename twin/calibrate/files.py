@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.twin.calibrate.identifiability import IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration, FittedParameter
 from terrafusion.twin.model.library import read_named
@@ -105,14 +105,4 @@ def mark_measured(vehicle: dict[str, Any], *names: str) -> None:
 
 def write_yaml(path: Path, content: dict[str, Any]) -> Path:
     """Write a mapping as YAML, in the order of its keys."""
-    from ruamel.yaml import YAML
-
-    yaml: Any = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.sort_base_mapping_type_on_output = False
-
-    def dump(part: Path) -> None:
-        with part.open("w", encoding="utf-8") as file:
-            yaml.dump(content, file)
-
-    return write_atomically(path, dump)
+    return dump_yaml(path, content, default_flow_style=False)

@@ -13,7 +13,8 @@ from terrafusion.twin.model.library import read_named
 from terrafusion.twin.scenario.scenario import (
     MAX_SLOPE_DEG,
     PLACE,
-    Canopy,
+    CanopyInterval,
+    CanopyStretch,
     DriveSegment,
     Duration,
     Interval,
@@ -24,7 +25,6 @@ from terrafusion.twin.scenario.scenario import (
 
 _Degrees = Annotated[float, Quantity("deg", -360.0, 360.0)]
 _LegLength = Annotated[float, Quantity("", 0.1, 1e6)]
-_Density = Annotated[float, Quantity("", 0.0, 1.0)]
 
 
 @dataclass(frozen=True)
@@ -35,20 +35,6 @@ class LegFile:
     length_m: _LegLength | None = None
     length_s: _LegLength | None = None
     moisture_percent: Annotated[float, Quantity("%", 0.0, 500.0)] | None = None
-
-
-@dataclass(frozen=True)
-class CanopyInterval(Interval):
-    """Trees from a time on."""
-
-    density: _Density
-
-
-@dataclass(frozen=True)
-class CanopyStretch(Stretch):
-    """Trees from a distance driven on."""
-
-    density: _Density
 
 
 def _by_travel(raw: Any) -> bool:
@@ -116,18 +102,11 @@ def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     values = {"name": stem} | {key: getattr(found, key) for key in raw}
     values["duration_s"] = found.total_s
     values["gnss_fix"] = None if found.gnss_fix == "best" else Fix[found.gnss_fix.upper()]
-    values["canopy"] = tuple(_canopy(trees) for trees in found.canopy)
     if found.route is not None:
         lengths = [*(getattr(leg, found.leg_key) for leg in found.route[:-1]), None]
         legs = zip(found.route, lengths, strict=True)
         values["route"] = tuple(RouteLeg(leg.terrain, length, leg.moisture_percent) for leg, length in legs)
     return Scenario(**values)
-
-
-def _canopy(trees: CanopyInterval | CanopyStretch) -> Canopy:
-    if isinstance(trees, CanopyInterval):
-        return Canopy(Interval(trees.start_s, trees.duration_s), trees.density)
-    return Canopy(Stretch(trees.start_m, trees.length_m), trees.density)
 
 
 def _problems(found: ScenarioFile) -> Iterator[tuple[str, str]]:

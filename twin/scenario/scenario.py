@@ -111,12 +111,26 @@ def inside(zone: Zone, t_s: Array, travel_m: Array) -> NDArray[np.bool_]:
     return zone.covers(t_s if isinstance(zone, Interval) else travel_m)
 
 
-@dataclass(frozen=True)
-class Canopy:
-    """Trees over a part of the drive: `density` from 0 (open sky) to 1 (no class of fix lasts)."""
+Density = Annotated[float, Quantity("", 0.0, 1.0)]
+"""Of trees: from 0 (open sky) to 1 (no class of fix lasts)."""
 
-    zone: Zone
-    density: float
+
+@dataclass(frozen=True)
+class CanopyInterval(Interval):
+    """Trees from a time on."""
+
+    density: Density
+
+
+@dataclass(frozen=True)
+class CanopyStretch(Stretch):
+    """Trees from a distance driven on."""
+
+    density: Density
+
+
+Canopy = CanopyInterval | CanopyStretch
+"""Trees over a part of the drive."""
 
 
 @dataclass(frozen=True)

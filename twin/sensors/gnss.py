@@ -46,7 +46,7 @@ class Sky:
         """The sky over a drive; where canopies overlap, the densest counts."""
         density, visible = np.zeros_like(t_s), np.ones(len(t_s), dtype=bool)
         for trees in canopy:
-            under = inside(trees.zone, t_s, travel_m)
+            under = inside(trees, t_s, travel_m)
             density = np.where(under, np.maximum(density, trees.density), density)
         for outage in outages:
             visible &= ~inside(outage, t_s, travel_m)

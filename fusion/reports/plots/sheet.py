@@ -84,16 +84,12 @@ class Sheet:
             log: whether that axis is logarithmic.
             limits: of that axis; by default those of the data.
         """
-        from bokeh.plotting import figure
-
-        fig = figure(
-            height=height, sizing_mode="stretch_width", x_range=self.time, y_axis_label=label,
-            y_axis_type="log" if log else "linear", toolbar_location="right", name=f"over time {key}",
-            tools="xbox_zoom,xpan,xwheel_zoom,reset", active_drag="xbox_zoom", active_scroll=None,
-            **({} if limits is None else {"y_range": tuple(map(float, limits))}),
+        shown = {} if limits is None else {"y_range": tuple(map(float, limits))}
+        plot = self.add(
+            f"over time {key}", None, label, height, "xbox_zoom,xpan,xwheel_zoom,reset",
+            x_range=self.time, y_axis_type="log" if log else "linear", active_drag="xbox_zoom", **shown,
         )  # fmt: skip
-        fig.add_layout(self.cursor)
-        plot = self._added(key, fig, height)
+        plot.panel.figure.add_layout(self.cursor)
         if self.outages:
             edges = np.array([(one.start_s, one.start_s + one.seconds) for one in self.outages])
             at = {"x0": edges[:, 0], "x1": edges[:, 1]}
@@ -105,7 +101,7 @@ class Sheet:
         return self.add(f"map {key}", x, y, height, "pan,wheel_zoom,box_zoom,reset", match_aspect=True)
 
     def add(
-        self, name: str, x: str, y: str, height: int = 320, tools: str = "pan,box_zoom,reset,save",
+        self, name: str, x: str | None, y: str, height: int = 320, tools: str = "pan,box_zoom,reset,save",
         **options: Any,
     ) -> Plot:  # fmt: skip
         """A figure of y over x; its key is the last word of `name`, `options` are of Bokeh's `figure`."""
@@ -115,7 +111,14 @@ class Sheet:
             height=height, sizing_mode="stretch_width", x_axis_label=x, y_axis_label=y, name=name,
             toolbar_location="right", tools=tools, active_scroll=None, **options,
         )  # fmt: skip
-        return self._added(name.split()[-1], fig, height)
+        fig.toolbar.logo = None
+        fig.title.text_color = style.NEUTRAL
+        fig.min_border_right = 4
+        for axis in (fig.xaxis, fig.yaxis):
+            axis.axis_label_text_font_style = "normal"
+        key = name.split()[-1]
+        self.panels[key] = Panel(fig, height)
+        return Plot(key, self.panels[key])
 
     def add_rows(self, name: str, x: str, rows: Sequence[str], row_px: int = 30, **options: Any) -> Plot:
         """A figure with a named row for each of 0, 1, ... from the top down."""
@@ -123,15 +126,6 @@ class Sheet:
         name_ticks(plot.panel.figure.yaxis, rows)
         plot.panel.figure.ygrid.visible = False
         return plot
-
-    def _added(self, key: str, fig: Figure, height: int) -> Plot:
-        fig.toolbar.logo = None
-        fig.title.text_color = style.NEUTRAL
-        fig.min_border_right = 4
-        for axis in (fig.xaxis, fig.yaxis):
-            axis.axis_label_text_font_style = "normal"
-        self.panels[key] = Panel(fig, height)
-        return Plot(key, self.panels[key])
 
     def parts(self) -> dict[str, Any]:
         """What `write_page` needs to show the figures."""

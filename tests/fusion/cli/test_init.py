@@ -110,7 +110,7 @@ def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: P
     assert radius["known"] == "calibrated"
     assert radius["value"] == pytest.approx(RADIUS_M, rel=0.03)
     assert robot["track_m"] == {"value": 0.51, "known": "measured"}
-    assert all("  # " in line for line in out.read_text().splitlines()[2:])
+    assert all(" # " in line for line in out.read_text().splitlines()[2:])
     schema = json.loads((ROOT / "docs" / "schemas" / "vehicle.schema.json").read_text())
     jsonschema.validate({"robot": robot}, schema)
     vehicle = load_vehicle(out)

@@ -15,7 +15,14 @@ from terrafusion.twin.model.sensor_realism import GnssRealism
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import state_slice
-from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
+from terrafusion.twin.scenario.scenario import (
+    CanopyInterval,
+    CanopyStretch,
+    DriveSegment,
+    Interval,
+    RouteLeg,
+    Scenario,
+)
 from terrafusion.twin.sensors.drive import counted
 from terrafusion.twin.sensors.gnss import FIX_LEVELS, Sky, fix_classes
 from terrafusion.twin.sensors.imu import triad
@@ -197,7 +204,7 @@ def test_a_receiver_without_a_fix_reports_nothing() -> None:
 def test_trees_degrade_the_fix_and_the_receiver_does_not_know_all_of_it() -> None:
     """Within a stretch of the way: lower classes, gaps, larger errors than the sigma says."""
     steady = realistic("gnss", reacquire_s=0.0, canopy_multipath_m=4.0)
-    scenario = straight(300.0, canopy=(Canopy(Stretch(100.0, 100.0), 0.6),))
+    scenario = straight(300.0, canopy=(CanopyStretch(100.0, 100.0, 0.6),))
     errors: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for seed in range(8):
         run = simulate(scenario, vehicle=steady, seed=seed)
@@ -219,7 +226,7 @@ def test_multipath_belongs_to_the_place() -> None:
     spec = dataclasses.replace(ELEVATE.sensors.gnss, sigma_horizontal_m=1.5, sigma_vertical_m=1.5)
     quiet = dataclasses.replace(quiet, sensors=dataclasses.replace(ELEVATE.sensors, gnss=spec))
     way = (DriveSegment(40.0, v_mps=1.0), DriveSegment(5.0), DriveSegment(40.0, v_mps=-1.0))
-    trees = (Canopy(Interval(0.0, 100.0), 1.0),)
+    trees = (CanopyInterval(0.0, 100.0, 1.0),)
     there_and_back = Scenario("return", 85.0, drive=way, canopy=trees)
     bare = dataclasses.replace(there_and_back, canopy=())
     with_trees, without = (simulate(s, vehicle=quiet, seed=4).gnss for s in (there_and_back, bare))
@@ -267,7 +274,7 @@ def test_a_current_sensor_has_gain_offset_and_steps() -> None:
 
 
 def test_an_exact_run_knows_no_error_of_any_sensor() -> None:
-    scenario = straight(20.0, canopy=(Canopy(Interval(0.0, 20.0), 0.9),))
+    scenario = straight(20.0, canopy=(CanopyInterval(0.0, 20.0, 0.9),))
     a: Recording = simulate(scenario, noiseless=True, seed=1)
     b: Recording = simulate(scenario, noiseless=True, seed=2)
     assert np.array_equal(a.imu.gyro_radps, b.imu.gyro_radps)
