@@ -18,40 +18,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned
 from terrafusion.fusion.calibration.numbers import WHEEL_SCALE, Knowledge
-from terrafusion.fusion.calibration.reduction import NODE, RATIO, YAW, Nodes, Noise, Reduction, X, Y
+from terrafusion.fusion.calibration.reduction import NODE, RATIO, YAW, Nodes, Reduction, X, Y
 from terrafusion.fusion.calibration.slip import slip_process
-
-ITERATIONS, CONVERGED = 10, 0.02
-"""Gauss-Newton steps at most; done when no number moves by more than this share of its sigma."""
-
-
-def fit(
-    drives: Sequence[MotionSegment],
-    starts: Sequence[tuple[complex, float]],
-    before: Knowledge,
-    noise: Noise,
-) -> Knowledge:
-    """The numbers after `drives`, each of which starts about a position (east + i north) and yaw (rad).
-
-    Raises:
-        LinAlgError: the drives determine no path.
-    """
-    now = before
-    parts = [started(drive, *start, now.mean) for drive, start in zip(drives, starts, strict=True)]
-    for i in range(ITERATIONS):
-        last, now = now, refined(parts, now, before, noise)
-        if i > 2 and (np.abs(now.mean - last.mean) < CONVERGED * now.sigma).all():
-            break
-    return now
-
-
-def refined(parts: Sequence[Nodes], now: Knowledge, before: Knowledge, noise: Noise) -> Knowledge:
-    """One Gauss-Newton step from the numbers `now`, with those known `before`; moves the nodes, too."""
-    reduced = [Reduction.of(part, now.mean, now.slip_spread, noise) for part in parts]
-    for one in reduced:
-        while not one.advance():
-            pass
-    return combined(reduced, now, before)
 
 
 def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) -> Knowledge:

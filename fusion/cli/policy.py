@@ -5,10 +5,14 @@ from typing import Annotated
 
 import typer
 
+from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.command import Result, add_command
 from terrafusion.fusion.cli.outputs import Output
 from terrafusion.fusion.cli.usage import CommandGroup
 
+HEADS = (
+    "ground", "slip", "a grade", "time, s", "wheel, m/s", "side-slip", "gyro x", "yaw x", "accel x", "GNSS x",
+)  # fmt: skip
 app = typer.Typer(help="The weighting policy: noise of each sensor by ground.", cls=CommandGroup)
 
 
@@ -52,18 +56,17 @@ def fit(
     with progress("runs", len(grid.conditions())) as tick:
         fitted = fit_policy(grid, tick, logged)
     write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))
-    lines = [
-        f"{'':12s} slip           a grade   time   wheel  side-slip  gyro   yaw  accel  GNSS",
-        f"{'':12s}                             s     m/s             x     x      x     x",
-    ]
     rows = {**fitted.classes, "fixed": fitted.fixed}
-    lines += [
-        f"{name:12s} {row.slip_mean:.3f} ± {row.slip_sigma:.3f} {row.slip_per_grade:8.2f}"
-        f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}"
-        f"  {row.gyro_inflation:4.1f}  {row.gyro_yaw_inflation:4.1f}  {row.accel_inflation:5.1f}"
-        f"  {row.gnss_inflation:4.2f}"
+    cells = [
+        [
+            name, f"{row.slip_mean:.3f} ± {row.slip_sigma:.3f}", f"{row.slip_per_grade:.2f}",
+            f"{row.slip_time_s:.1f}", f"{row.wheel_sigma_mps:.4f}", f"{row.side_slip_sigma:.4f}",
+            f"{row.gyro_inflation:.1f}", f"{row.gyro_yaw_inflation:.1f}", f"{row.accel_inflation:.1f}",
+            f"{row.gnss_inflation:.2f}",
+        ]
         for name, row in rows.items()
-    ]
+    ]  # fmt: skip
+    lines = text_table(HEADS, cells, right=range(2, len(HEADS)))
     document = {name: dataclasses.asdict(row) for name, row in rows.items()}
     done = f"inputs {fitted.inputs_sha256[:16]}; written to {out}"
     return Result(lines, done, {"out": str(out), "inputs_sha256": fitted.inputs_sha256, "rows": document})

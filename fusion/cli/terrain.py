@@ -174,12 +174,12 @@ def no_seeds(seeds: int | None) -> None:
 
 def score_lines(name: str, scores: DetectorScores) -> list[str]:
     """The scores as a table."""
+    from terrafusion.fusion.training.detector_scores import confusion_lines
+
     median, p95, largest = scores.switch_delay_s
-    rows = [(truth, row) for truth, row in zip(scores.classes, scores.confusion, strict=False) if any(row)]
     return [
         f"{name}: {scores.windows} windows",
-        f"{'true ground':13s} " + " ".join(f"{c:>12s}" for c in scores.classes),
-        *(f"{truth:13s} " + " ".join(f"{share:12.3f}" for share in row) for truth, row in rows),
+        *confusion_lines(scores.classes, scores.confusion),
         f"macro-F1 {scores.macro_f1:.3f}; ECE {scores.ece:.3f}; unknown {scores.unknown_share:.3f}",
         f"ground change detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
         f"missed {scores.switches_missed:.1%}; false changes {scores.false_switches_per_min:.2f}/min",

@@ -79,13 +79,14 @@ def write_section(path: Path, robot: Mapping[str, Any], comments: Mapping[str, s
         ConfigError: a number is out of range.
         TerrafusionError: the file cannot be written.
     """
-    from ruamel.yaml.comments import CommentedMap
+    from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
     structure(RobotFile, {"robot": dict(robot)}, file=path)
     section = CommentedMap()
     for name, entry in robot.items():
-        section[name] = CommentedMap(entry) if isinstance(entry, dict) else entry
-        if isinstance(entry, dict):
+        section[name] = entry
+        if isinstance(entry, (dict, list)):
+            section[name] = CommentedMap(entry) if isinstance(entry, dict) else CommentedSeq(entry)
             section[name].fa.set_flow_style()
         if name in comments:
             section.yaml_add_eol_comment(" ".join(comments[name].split()), name, column=COMMENT_COLUMN)

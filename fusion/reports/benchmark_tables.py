@@ -62,14 +62,12 @@ def group_name(family: str, plant: str) -> str:
 
 def _main(rows: Sequence[RunScore]) -> Section:
     """Median error of the fixed noise, and the ratios to it."""
-    results = contrasts(rows)
     methods = [method.name for method in METHODS if method.name != BASELINE]
     lines = []
-    for family, plant in groups_of(rows):
-        of = {c.method: c for c in results if (c.family, c.plant) == (family, plant)}
+    for group, of in _by_method(contrasts(rows)).items():
         if BASELINE in of:
             units = of[BASELINE].units
-            head = [group_name(family, plant), str(units), number(of[BASELINE].error_m)]
+            head = [group_name(*group), str(units), number(of[BASELINE].error_m)]
             lines.append([*head, *(_ratio(of.get(method), units) for method in methods)])
     about = (
         f"Root mean square position error inside the outage: its median for {BASELINE} (tuned), and for the "
@@ -78,6 +76,14 @@ def _main(rows: Sequence[RunScore]) -> Section:
         "every drive has labels."
     )
     return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *methods), tuple(lines))
+
+
+def _by_method(results: Iterable[Contrast]) -> dict[tuple[str, str], dict[str, Contrast]]:
+    """Family and plant -> method -> contrast."""
+    groups: dict[tuple[str, str], dict[str, Contrast]] = {}
+    for c in results:
+        groups.setdefault((c.family, c.plant), {})[c.method] = c
+    return groups
 
 
 def _targets(results: Iterable[Target]) -> Section:
@@ -117,9 +123,7 @@ def _reasons(results: Iterable[Reason]) -> Section:
 
 def _wins(results: Iterable[Contrast]) -> Section:
     methods = [method.name for method in METHODS if method.name != BASELINE]
-    groups: dict[tuple[str, str], dict[str, Contrast]] = {}
-    for c in results:
-        groups.setdefault((c.family, c.plant), {})[c.method] = c
+    groups = _by_method(results)
     lines = [
         [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in methods)]
         for key, of in groups.items()
@@ -176,7 +180,8 @@ def _field(rows: Sequence[RunScore]) -> Section:
             method.name: [row.error_m for row in own if (row.unit, row.method) == (log, method.name)]
             for method in METHODS
         }
-        lines.append([log, str(len(of[BASELINE])), *(_median(of[method.name]) for method in METHODS)])
+        medians = [number(known_median(of[m.name])) if of[m.name] else "-" for m in METHODS]
+        lines.append([log, str(len(of[BASELINE])), *medians])
     about = "Median over the outages of a log, m; against truth, or held-out fixes with their noise."
     return Section("Field logs", about, ("log", "drives", *(method.name for method in METHODS)), tuple(lines))
 
@@ -217,7 +222,3 @@ def _cell(cell: PooledConsistency) -> str:
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100.0 * share:.0f} %"
-
-
-def _median(values: Sequence[float | None]) -> str:
-    return "-" if not values else number(known_median(values))

@@ -58,8 +58,17 @@ def write_diagnosis(
         out / "report.html", "gap.html.j2", f"Gap between {d.vehicle} and its twin",
         verdicts=[VerdictBox(_value(d), verdict_line(d), ())], tiles=_tiles(d),
         sections=sections(d), provenance=provenance, packages=TWIN_LIBRARIES, where=_where(d),
-        causes=_causes(d), sets=_sets(d), drives=_drives(d), notes=d.notes, paths=paths, errors=errors,
-        estimator_gap=_estimator_gap(scores), failed=[f"left out: {line}" for line in failed],
+        causes=_causes(d), drives=_drives(d),
+        sets=[
+            (alternatives_text(s), percent(s.probability), "yes" if s.named else "no")
+            for s in d.verdict.sets
+        ],
+        notes=d.notes, paths=paths, errors=errors,
+        estimator_gap=[
+            [s.score, *("" if v is None else f"{v:.3g}" for v in (s.references, s.runs, s.twin, s.corrected))]
+            for s in scores
+        ],
+        failed=[f"left out: {line}" for line in failed],
         **sheet.parts(),
     )  # fmt: skip
 
@@ -114,21 +123,8 @@ def _causes(d: GapDiagnosis) -> list[list[str]]:
     ]
 
 
-def _sets(d: GapDiagnosis) -> list[list[str]]:
-    return [
-        [alternatives_text(s), percent(s.probability), "yes" if s.named else "no"] for s in d.verdict.sets
-    ]
-
-
 def _drives(d: GapDiagnosis) -> list[str]:
     if d.drives is None:
         return ["There are no references to compare the drives with."]
     covered = f"The references cover {percent(d.drives.covered)} of the time of these drives."
     return [covered, *(f"They lack: {what}" for what in d.drives.missing)]
-
-
-def _estimator_gap(scores: Sequence[Compared]) -> list[list[str]]:
-    return [
-        [s.score, *("" if v is None else f"{v:.3g}" for v in (s.references, s.runs, s.twin, s.corrected))]
-        for s in scores
-    ]

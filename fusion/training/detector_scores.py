@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.metrics.classification import classification_scores
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
@@ -150,3 +151,13 @@ def _switches(
             missed += 1
     false = int((settled[1:] & (winner[1:] != winner[:-1])).sum())
     return delays, missed, false
+
+
+def confusion_lines(classes: Sequence[str], confusion: Sequence[Sequence[float]]) -> list[str]:
+    """A row a true class with the shares of what was recognised; classes that did not occur are left out."""
+    rows = [
+        [truth, *(f"{share:.3f}" for share in row)]
+        for truth, row in zip(classes, confusion, strict=True)
+        if any(row)
+    ]
+    return text_table(["true ground", *classes], rows, right=range(1, len(classes) + 1))

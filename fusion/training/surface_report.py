@@ -17,6 +17,7 @@ from terrafusion.fusion.training.cross_validation import (
     train_on,
     window_ms,
 )
+from terrafusion.fusion.training.detector_scores import confusion_lines
 from terrafusion.fusion.training.softmax import SoftmaxModel
 from terrafusion.fusion.training.surface_features import SURFACE_FEATURES
 
@@ -97,7 +98,7 @@ def figures_lines(report: dict[str, Any]) -> list[str]:
             "",
             f"{name}: macro-F1 {figures['macro_f1']:.3f}, accuracy {figures['accuracy']:.3f}, "
             f"ECE {figures['ece']:.3f}, {figures['windows']} windows",
-            *_table(figures),
+            *confusion_lines(figures["classes"], figures["confusion"]),
         ]
     return lines
 
@@ -115,12 +116,6 @@ def lines_of(report: dict[str, Any]) -> list[str]:
             f"classified as unknown there {other['odd']:.3f}",
         ]
     return lines
-
-
-def _table(figures: dict[str, Any]) -> list[str]:
-    head = " " * 14 + " ".join(f"{c:>12s}" for c in figures["classes"])
-    rows = zip(figures["classes"], figures["confusion"], strict=True)
-    return [head, *(f"{c:14s}" + " ".join(f"{share:12.3f}" for share in row) for c, row in rows)]
 
 
 def _odd(

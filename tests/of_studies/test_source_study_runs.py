@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Imu
-from terrafusion.twin.analysis import speeds as processing
-from terrafusion.twin.analysis.speeds import Profiles, differenced_speed, imu_speed, low_pass, match
+from terrafusion.twin.analysis.speeds import differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.simulate import simulate
 from tests.studies.source_study import measures
+from tests.studies.source_study import profiles as processing
 from tests.studies.source_study.cases import UNEVEN, CaseRun, run_case
 from tests.studies.source_study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
+from tests.studies.source_study.profiles import Profiles
 from tests.studies.source_study.published import CASES, platform_figures
 from tests.studies.source_study.spread import spread
 

@@ -159,3 +159,8 @@ def two(names: tuple[str, str], unit: str, scale: float, limit: float) -> tuple[
     """Two parameters with one unit, scale and range -limit to limit."""
     first, second = names
     return Parameter(unit, scale, -limit, limit, first), Parameter(unit, scale, -limit, limit, second)
+
+
+def braked(q: Quantities, torque: Any) -> dict[str, Any]:
+    """A wheel with a torque against its rotation."""
+    return {"drag_torque_nm": q["drag_torque_nm"] + torque}

@@ -5,7 +5,7 @@ from typing import Any
 
 import casadi as ca
 
-from terrafusion.twin.effects.form import Form, Quantities, one
+from terrafusion.twin.effects.form import Form, Quantities, braked, one
 from terrafusion.twin.physics.smooth import grown, saturate, smooth_abs
 from terrafusion.twin.physics.wheel import RESISTANCE_SPEED_MPS
 
@@ -82,27 +82,11 @@ def _rotation_sign(q: Quantities) -> Any:
     return q["rim_mps"] / smooth_abs(q["rim_mps"], CLINGING_SPEED_MPS)
 
 
-def _clinging(q: Quantities, share: Any) -> dict[str, Any]:
-    torque = share * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * _rotation_sign(q)
-    return {"drag_torque_nm": q["drag_torque_nm"] + torque}
-
-
-def _in_motion(q: Quantities, share: Any) -> dict[str, Any]:
-    """A rolling resistance that does not hold at rest."""
-    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * _rotation_sign(q)}
-
-
-def _with_speed(q: Quantities, share: Any) -> dict[str, Any]:
-    """A rolling resistance in proportion to the speed of the rim."""
-    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * q["rim_mps"]}
-
-
 def _sucking(q: Quantities, pressure: Any) -> dict[str, Any]:
     """Suction under the rear contact that does not hold at rest."""
     z = q["sinkage_m"]
     chord_square = 2.0 * q["radius_m"] * z - z * z + q["contact_floor_m"] * q["contact_floor_m"]
-    torque = 0.5 * pressure * q["width_m"] * chord_square * _rotation_sign(q)
-    return {"drag_torque_nm": q["drag_torque_nm"] + torque}
+    return braked(q, 0.5 * pressure * q["width_m"] * chord_square * _rotation_sign(q))
 
 
 def _lateral(q: Quantities, share: Any) -> dict[str, Any]:
@@ -147,11 +131,13 @@ FORMS = (
         "rolling torque (c_rr + e) W R", "as the model's own c_rr",
     ),
     Form(
-        "motion_resistance", "in_motion", one("", 0.03, 0.0, 0.5), {"wheel": _in_motion},
+        "motion_resistance", "in_motion", one("", 0.03, 0.0, 0.5),
+        {"wheel": lambda q, e: braked(q, e * q["load_n"] * q["radius_m"] * _rotation_sign(q))},
         "rolling torque e W R w / sqrt(w^2 + (0.05 m/s / R)^2)", "the same without a hold at rest",
     ),
     Form(
-        "motion_resistance", "with_speed", one("s/m", 0.03, 0.0, 0.5), {"wheel": _with_speed},
+        "motion_resistance", "with_speed", one("s/m", 0.03, 0.0, 0.5),
+        {"wheel": lambda q, e: braked(q, e * q["load_n"] * q["radius_m"] * q["rim_mps"])},
         "rolling torque e W R^2 w", "a coefficient that grows with speed, as Gillespie 1992",
     ),
     Form(
@@ -218,7 +204,10 @@ FORMS = (
         "torque e b l^2 / 2 w / sqrt(w^2 + (0.05 m/s / R)^2)", "the same without a hold at rest",
     ),
     Form(
-        "mud_adhesion", "build_up", one("", 0.03, 0.0, 0.5), {"wheel": _clinging},
+        "mud_adhesion", "build_up", one("", 0.03, 0.0, 0.5),
+        {"wheel": lambda q, e: braked(
+            q, e * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * _rotation_sign(q)
+        )},
         "torque e W R s^2 / (s^2 + (5 m)^2) against rolling, s travel", "ours",
     ),
     Form(

@@ -5,7 +5,7 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Parameter, Quantities, one
+from terrafusion.twin.effects.form import Form, Parameter, Quantities, braked, one
 from terrafusion.twin.physics.layout import WHEELS
 from terrafusion.twin.physics.smooth import grown
 
@@ -70,10 +70,6 @@ def _seen_through_backlash(q: Quantities, gap: Any) -> dict[str, Any]:
 def _slack(q: Quantities, share: Any) -> dict[str, Any]:
     """A part of the torque is lost while no flank carries."""
     return {"drive_torque_nm": q["drive_torque_nm"] * (1.0 - share * (1.0 - q["play"] * q["play"]))}
-
-
-def _braked(q: Quantities, torque: Any) -> dict[str, Any]:
-    return {"drag_torque_nm": q["drag_torque_nm"] + torque}
 
 
 def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
@@ -167,7 +163,7 @@ FORMS = (
     ),
     Form(
         "drivetrain_friction", "coulomb", one("N m", 0.3, 0.0, 5.0),
-        {"wheel": lambda q, e: _braked(q, e * ca.tanh(q["wheel_speed"] / FRICTION_SPEED_RADPS))},
+        {"wheel": lambda q, e: braked(q, e * ca.tanh(q["wheel_speed"] / FRICTION_SPEED_RADPS))},
         "torque e tanh(w / 0.1 rad/s) against rotation, each wheel", "Coulomb, smoothed",
     ),
     Form(
@@ -176,7 +172,7 @@ FORMS = (
     ),
     Form(
         "drivetrain_friction", "viscous", one("N m s/rad", 0.1, 0.0, 5.0),
-        {"wheel": lambda q, e: _braked(q, e * q["wheel_speed"])},
+        {"wheel": lambda q, e: braked(q, e * q["wheel_speed"])},
         "torque e w against rotation, each wheel", "viscous",
     ),
     Form(

@@ -13,10 +13,10 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.analysis.speeds import speed_errors
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.engine.integrate import raise_if_diverged
 from terrafusion.twin.engine.lanes import integrate_many
-from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, state_slice
 from terrafusion.twin.run_setup import RunSetup, set_up
@@ -107,7 +107,9 @@ def arguments(sweep: Sweep, case: SweepPoint) -> dict[str, Any]:
     """The arguments of `simulate_run` for a run of the sweep."""
     soils = dict(sweep.soils)
     if case.friction is not None:
-        soils |= {name: _capped(soils[name], case.friction) for name in _grounds(sweep, case)}
+        for name in _grounds(sweep, case):
+            shear = dataclasses.replace(soils[name].shear, friction_cap=case.friction)
+            soils[name] = dataclasses.replace(soils[name], shear=shear)
     return {
         "scenario": at_speed(sweep.scenario, sweep.speed_scale(case)),
         "vehicle": sweep.vehicle,
@@ -122,10 +124,6 @@ def arguments(sweep: Sweep, case: SweepPoint) -> dict[str, Any]:
 def _grounds(sweep: Sweep, case: SweepPoint) -> list[str]:
     """Names of the grounds along the route."""
     return [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
-
-
-def _capped(soil: SoilParams, friction: float) -> SoilParams:
-    return dataclasses.replace(soil, shear=dataclasses.replace(soil.shear, friction_cap=friction))
 
 
 def _with_sensors(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row | Exception]:
@@ -201,10 +199,8 @@ def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float:
 
 
 def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
-    from terrafusion.twin.analysis.speeds import profiles_of, speed_errors
-
-    errors = speed_errors(profiles_of(recording, vehicle.odometry.wheel_radius_m))
-    return {"odometry_error_pct": errors.odometry, "imu_error_pct": errors.imu, "gnss_error_pct": errors.gnss}
+    errors = speed_errors(recording, vehicle.odometry.wheel_radius_m)
+    return {f"{name}_error_pct": error for name, error in errors.items()}
 
 
 def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:

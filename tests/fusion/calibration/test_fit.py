@@ -9,7 +9,7 @@ import pytest
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import reduction
-from terrafusion.fusion.calibration.fit import fit, information_gained, refined, started
+from terrafusion.fusion.calibration.fit import information_gained, started
 from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
@@ -22,7 +22,7 @@ from terrafusion.fusion.calibration.numbers import (
     assumed,
 )
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
-from tests.fusion.calibration.nodes import node_starts
+from tests.fusion.calibration.nodes import fit, node_starts, refined
 
 NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
 TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.004])

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.analysis.speeds import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
+from tests.studies.source_study.profiles import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
 from tests.studies.source_study.published import SCENARIO, VEHICLE, StudyCase
 
 UNEVEN = Variation(strength_sigma=0.2, length_m=0.5)

@@ -15,16 +15,9 @@ from typing import Self
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.analysis.speeds import (
-    OTHERS,
-    USUAL,
-    Assumed,
-    Profiles,
-    differenced_speed,
-    match,
-    mean_percent,
-)
+from terrafusion.twin.analysis.speeds import differenced_speed, match, mean_percent
 from tests.studies.source_study.cases import CaseRun
+from tests.studies.source_study.profiles import OTHERS, USUAL, Assumed, Profiles
 
 RATES_HZ = (1.0, 5.0, 10.0, 100.0)  # rates at which positions may have been differenced; the study names none
 SIGMAS_M = (1e-4, 10.0)  # sizes of noise that are searched

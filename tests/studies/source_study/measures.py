@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Mask
-from terrafusion.twin.analysis.speeds import MOVING_MPS, Profiles, mean_percent
+from terrafusion.twin.analysis.speeds import MOVING_MPS, mean_percent
 from tests.studies.source_study.cases import CaseRun, between, set_off_s, stopped_s
+from tests.studies.source_study.profiles import Profiles
 
 RAMP_S = 4.0  # after a stop the robot needs this long to reach the command within its limit of acceleration
 SINKING_S = 10.0  # before it stops for good on mud, the robot follows the command until this long before

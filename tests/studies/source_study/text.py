@@ -4,10 +4,10 @@ import itertools
 from collections.abc import Sequence
 
 from terrafusion.datasets.core.tables import markdown_table
-from terrafusion.twin.analysis.speeds import OTHERS, USUAL
 from tests.studies.source_study.cases import CaseRun
 from tests.studies.source_study.claims import PREDICTED, ClaimResult, counts
 from tests.studies.source_study.gnss_noise import DATA_SHEET_M, rate_for
+from tests.studies.source_study.profiles import OTHERS, USUAL
 from tests.studies.source_study.published import CASES, StudyCase
 from tests.studies.source_study.spread import spread
 from tests.studies.source_study.study import Study
