@@ -136,25 +136,23 @@ def _draw(
     marked: Sequence[WeightChange],
 ) -> tuple[Sheet, list[str]]:
     """All figures, and the keys of those of the innovations."""
-    start, estimate = recording.start_ns, shown.estimate
+    estimate = shown.estimate
     estimates = {run.name: run.estimate for run in runs}
     colours = _colours(runs)
     scored = {run.name: run.scores.errors for run in runs if run.scores.errors is not None}
-    sheet = Sheet(_duration_s(estimates, recording), outages)
-    replay_map.plot_map(
-        sheet, estimates, shown.name, recording, colours, errors=scored, held_out=held_out, outages=outages
-    )
+    sheet = Sheet(_duration_s(estimates, recording), outages, recording.start_ns)
+    replay_map.plot_map(sheet, estimates, shown.name, recording, colours, errors=scored, held_out=held_out)
     if scored:
-        plots.plot_error_runs(sheet, scored, start, colours)
-    plots.plot_slip(sheet, estimates, shown.name, start, colours)
+        plots.plot_error_runs(sheet, scored, colours)
+    plots.plot_slip(sheet, estimates, shown.name, colours)
     if shown.name in scored:
-        plots.plot_errors(sheet, scored[shown.name], start)
+        plots.plot_errors(sheet, scored[shown.name])
     plots.plot_terrain(sheet, estimate, recording)
-    plots.plot_skid_steering(sheet, estimate, start)
-    plots.plot_weights(sheet, estimate, start, marked=marked)
+    plots.plot_skid_steering(sheet, estimate)
+    plots.plot_weights(sheet, estimate, marked=marked)
     plots.plot_speeds(sheet, estimate, recording, wheel_radius_m=wheel_radius_m)
-    replay_filter.plot_biases(sheet, estimate, start)
-    return sheet, replay_filter.plot_innovations(sheet, estimate, start)
+    replay_filter.plot_biases(sheet, estimate)
+    return sheet, replay_filter.plot_innovations(sheet, estimate)
 
 
 def _colours(runs: Sequence[ReportRun]) -> dict[str, str]:

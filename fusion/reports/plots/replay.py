@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
@@ -33,21 +34,18 @@ _SKID_STEERING = (
 )
 
 
-def plot_error_runs(
-    sheet: Sheet, errors: Mapping[str, Errors], start_ns: int, colours: Mapping[str, str]
-) -> None:
+def plot_error_runs(sheet: Sheet, errors: Mapping[str, Errors], colours: Mapping[str, str]) -> None:
     """Horizontal distance between estimate and reference, a line a run."""
     plot = sheet.add_time("error_runs", "position error, m", 240)
     for name, one in errors.items():
         distance = one.distance_m()
         peak = [int(np.nanargmax(distance))] if np.isfinite(distance).any() else []
-        t = style.seconds(one.t_ns, start_ns)
-        plot.line(t, distance, name, colours[name], keep=peak)
+        plot.line(sheet.seconds(one.t_ns), distance, name, colours[name], keep=peak)
 
 
-def plot_errors(sheet: Sheet, errors: Errors, start_ns: int) -> None:
+def plot_errors(sheet: Sheet, errors: Errors) -> None:
     """East, north and heading error (deg) with the estimated band of two sigma."""
-    t = style.seconds(errors.t_ns, start_ns)
+    t = sheet.seconds(errors.t_ns)
     error, P = errors.position_error_m(), errors.covariance_m2
     rows = [
         ("error_east", "east error, m", error[:, 0], np.sqrt(P[:, 0, 0])),
@@ -63,11 +61,11 @@ def plot_errors(sheet: Sheet, errors: Errors, start_ns: int) -> None:
 
 
 def plot_slip(
-    sheet: Sheet, estimates: Mapping[str, Estimate], shown: str, start_ns: int, colours: Mapping[str, str]
+    sheet: Sheet, estimates: Mapping[str, Estimate], shown: str, colours: Mapping[str, str]
 ) -> None:
     """Estimated slip of each run, and the band of two sigma and the most probable ground of the one shown."""
     estimate = estimates[shown]
-    t, s, sigma = style.seconds(estimate.trajectory.t_ns, start_ns), estimate.slip, estimate.slip_sigma
+    t, s, sigma = sheet.seconds(estimate.trajectory.t_ns), estimate.slip, estimate.slip_sigma
     rows = style.thin(len(t))
     edges = np.concatenate([(s - 2 * sigma)[rows], (s + 2 * sigma)[rows]])
     low, high = style.robust_limits(edges, include=(0.0, 0.1))
@@ -75,15 +73,16 @@ def plot_slip(
     _shade_terrain(plot, estimate, t)
     plot.band(t, s, sigma, f"±2 sigma ({shown})", colours[shown])
     for name, one in estimates.items():
-        plot.line(style.seconds(one.trajectory.t_ns, start_ns), one.slip, name, colours[name])
+        plot.line(sheet.seconds(one.trajectory.t_ns), one.slip, name, colours[name])
 
 
 def plot_terrain(sheet: Sheet, estimate: Estimate, recording: Recording) -> None:
     """Probabilities of the terrain classes, stacked; a strip on top shows the label of the log, if any."""
-    t = style.seconds(estimate.trajectory.t_ns, recording.start_ns)
+    t = sheet.seconds(estimate.trajectory.t_ns)
     rows = style.thin(len(t))
     p = np.nan_to_num(estimate.terrain[rows])
-    labelled = recording.terrain is not None and len(recording.terrain) > 0
+    terrain = recording.terrain
+    labelled = terrain is not None and len(terrain) > 0
     plot = sheet.add_time(
         "terrain", "probability of the ground", 200, limits=(0.0, 1.16 if labelled else 1.0)
     )
@@ -93,16 +92,15 @@ def plot_terrain(sheet: Sheet, estimate: Estimate, recording: Recording) -> None
             data = {"x": t[rows], "y1": floor, "y2": floor + p[:, i]}
             plot.glyph("varea", data, style.label_text(name), style.terrain_colour(name), "area", alpha=0.85)
             floor = floor + p[:, i]
-    if labelled:
-        _label_strip(plot, recording, float(t[-1]) if len(t) else recording.duration_s())
+    if terrain is not None and labelled:
+        end_s = float(t[-1]) if len(t) else recording.duration_s()
+        _label_strip(plot, sheet.seconds(terrain.t_ns), terrain.label, end_s)
 
 
-def plot_weights(
-    sheet: Sheet, estimate: Estimate, start_ns: int, *, marked: Sequence[WeightChange] = ()
-) -> None:
+def plot_weights(sheet: Sheet, estimate: Estimate, *, marked: Sequence[WeightChange] = ()) -> None:
     """Noise of each sensor (log scale); the times of the changes `marked` are numbered from 1."""
-    t = style.seconds(estimate.trajectory.t_ns, start_ns)
-    marks = np.array([(t_ns - start_ns) * 1e-9 for t_ns in change_numbers(marked)])
+    t = sheet.seconds(estimate.trajectory.t_ns)
+    marks = sheet.seconds(np.array([*change_numbers(marked)], dtype=np.int64))
     for key, weights, label in (
         ("weight_sigmas", _SIGMAS, "1 sigma"),
         ("weight_factors", _FACTORS, "times data sheet"),
@@ -130,30 +128,30 @@ def plot_speeds(
     """Forward speed of the wheels and as estimated, and of GNSS and truth where there are any."""
     plot = sheet.add_time("speeds", "forward speed, m/s", 220)
     wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
-    start, colours = recording.start_ns, style.SENSOR_COLOURS
+    colours = style.SENSOR_COLOURS
     if wheels is not None and len(wheels) and (wheels.unit == "mps" or wheel_radius_m is not None):
         speed = wheels.side_speeds_mps(wheel_radius_m or 1.0).mean(axis=1)
-        plot.line(style.seconds(wheels.t_ns, start), speed, "wheels", colours["wheels"], width=1.0)
+        plot.line(sheet.seconds(wheels.t_ns), speed, "wheels", colours["wheels"], width=1.0)
     if gnss is not None and gnss.velocity_enu_mps is not None:
         speed = np.hypot(gnss.velocity_enu_mps[:, 0], gnss.velocity_enu_mps[:, 1])
         rows = style.thin(len(speed))
-        t = style.seconds(gnss.t_ns, start)[rows]
+        t = sheet.seconds(gnss.t_ns)[rows]
         plot.dots(t, speed[rows], "GNSS (absolute)", colours["gnss_velocity"], size=3.0)
     listed = recording.truth_channels
     if truth is not None and truth.twist_body is not None and (not listed or "velocity" in listed):
-        t = style.seconds(truth.t_ns, start)
-        plot.line(t, truth.twist_body[:, 0], "truth", style.TRUTH_ON_ANY, width=2.4, alpha=0.6)
+        speed, t = truth.twist_body[:, 0], sheet.seconds(truth.t_ns)
+        plot.line(t, speed, "truth", style.TRUTH_ON_ANY, width=2.4, alpha=0.6)
     path = estimate.trajectory
     if path.twist_body is not None:
         forward = path.twist_body[:, 0]
     else:
         forward = np.linalg.norm(estimate.velocity_mps[:, :2], axis=1)
-    plot.line(style.seconds(path.t_ns, start), forward, "estimate", colours["gnss"])
+    plot.line(sheet.seconds(path.t_ns), forward, "estimate", colours["gnss"])
 
 
-def plot_skid_steering(sheet: Sheet, estimate: Estimate, start_ns: int) -> None:
+def plot_skid_steering(sheet: Sheet, estimate: Estimate) -> None:
     """Yaw scale, side-slip and centre of rotation, those that were estimated, with bands of two sigma."""
-    t = style.seconds(estimate.trajectory.t_ns, start_ns)
+    t = sheet.seconds(estimate.trajectory.t_ns)
     rows = style.thin(len(t))
     for name, label, colour in _SKID_STEERING:
         state = series(estimate, name)
@@ -210,17 +208,15 @@ def _shade_terrain(plot: Plot, estimate: Estimate, t_s: Array) -> None:
         plot.glyph("vstrip", data, style.label_text(name), colour, "area", alpha=0.3, line_width=0)
 
 
-def _label_strip(plot: Plot, recording: Recording, end_s: float) -> None:
-    terrain = recording.terrain
-    assert terrain is not None
-    t = style.seconds(terrain.t_ns, recording.start_ns)
-    runs = style.runs_of(terrain.label)
+def _label_strip(plot: Plot, t: Array, label: NDArray[Any], end_s: float) -> None:
+    """A strip on top with the label at times (N,), which holds until the next one."""
+    runs = style.runs_of(label)
     data = {
         "left": t[[first for first, _ in runs]],
         "right": np.array([t[last] if last < len(t) else max(end_s, t[-1]) for _, last in runs]),
         "bottom": np.full(len(runs), 1.05),
         "top": np.full(len(runs), 1.15),
-        "colour": np.array([style.terrain_colour(terrain.label[first]) for first, _ in runs], dtype=object),
+        "colour": np.array([style.terrain_colour(label[first]) for first, _ in runs], dtype=object),
     }
     plot.glyph("quad", data, "", None, "area", line_width=0)
 

@@ -16,9 +16,9 @@ SHOWN_SIGMAS = 4.5
 EXPECTED_LABEL = "95 % if consistent"
 
 
-def plot_biases(sheet: Sheet, estimate: Estimate, start_ns: int) -> None:
+def plot_biases(sheet: Sheet, estimate: Estimate) -> None:
     """Gyro biases in degrees a second and accelerometer biases, body axes, with bands of two sigma."""
-    t = style.seconds(estimate.trajectory.t_ns, start_ns)
+    t = sheet.seconds(estimate.trajectory.t_ns)
     sigma = estimate.bias_sigma if estimate.bias_sigma is not None else np.full((len(t), 6), np.nan)
     rows = (
         ("bias_gyro", "gyro bias, deg/s", np.degrees(estimate.gyro_bias_radps), np.degrees(sigma[:, :3])),
@@ -32,7 +32,7 @@ def plot_biases(sheet: Sheet, estimate: Estimate, start_ns: int) -> None:
                 plot.line(t, values[:, i], axis, colour)
 
 
-def plot_innovations(sheet: Sheet, estimate: Estimate, start_ns: int) -> list[str]:
+def plot_innovations(sheet: Sheet, estimate: Estimate) -> list[str]:
     """For each sensor its normalised innovations, and below the mean of their squares in windows.
 
     Both with the band that holds 95 % where the covariance is consistent; that of the windows allows for
@@ -47,8 +47,8 @@ def plot_innovations(sheet: Sheet, estimate: Estimate, start_ns: int) -> list[st
         rejected = [x.t_ns for x in estimate.innovations if x.sensor == sensor and not x.accepted]
         word = "".join(c if c.isalnum() else "_" for c in sensor)
         keys += [f"innovation_{word}", f"nis_{word}"]
-        _normalised(sheet, keys[-2], whitened, np.array(rejected, dtype=np.int64), sensor, start_ns)
-        _windows(sheet, keys[-1], whitened, sensor, start_ns)
+        _normalised(sheet, keys[-2], whitened, np.array(rejected, dtype=np.int64), sensor)
+        _windows(sheet, keys[-1], whitened, sensor)
     return keys
 
 
@@ -61,12 +61,7 @@ def _settled_limits(values: Array, spread: Array) -> tuple[float, float]:
 
 
 def _normalised(
-    sheet: Sheet,
-    key: str,
-    whitened: consistency.Whitened,
-    rejected_ns: NDArray[np.int64],
-    sensor: str,
-    start_ns: int,
+    sheet: Sheet, key: str, whitened: consistency.Whitened, rejected_ns: NDArray[np.int64], sensor: str
 ) -> None:
     """The innovations over their own sigma; one dot a dimension."""
     label = f"{style.label_text(sensor, 20)} innovation / sigma"
@@ -74,7 +69,7 @@ def _normalised(
     band = {"y0": np.array([-NORMAL_95]), "y1": np.array([NORMAL_95])}
     plot.glyph("hstrip", band, EXPECTED_LABEL, style.EXPECTED_ON_ANY, "area", alpha=0.3, line_width=0)
     rejected = np.isin(whitened.t_ns, rejected_ns)
-    t = style.seconds(whitened.t_ns, start_ns)
+    t = sheet.seconds(whitened.t_ns)
     values = np.clip(whitened.values, -SHOWN_SIGMAS, SHOWN_SIGMAS)
     colour = style.colour_of(sensor, style.SENSOR_COLOURS)
     for chosen, marker, size, shade, name in (
@@ -88,9 +83,9 @@ def _normalised(
             plot.dots(np.repeat(t[rows], columns), values[rows].ravel(), name, shade, marker, size)
 
 
-def _windows(sheet: Sheet, key: str, whitened: consistency.Whitened, sensor: str, start_ns: int) -> None:
+def _windows(sheet: Sheet, key: str, whitened: consistency.Whitened, sensor: str) -> None:
     """Mean NIS a dimension in windows, as steps over its band."""
-    windows = consistency.over_time(whitened, start_ns)
+    windows = consistency.over_time(whitened, sheet.start_ns)
     tops = np.array([bound for w in windows for bound in (w.high, w.mean)])
     limits = (0.0, style.robust_limits(tops, include=(2.0,))[1])
     plot = sheet.add_time(key, f"{style.label_text(sensor, 20)} NIS / dof", 170, limits=limits)

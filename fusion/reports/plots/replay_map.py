@@ -74,7 +74,6 @@ def plot_map(
     *,
     errors: Mapping[str, Errors],
     held_out: Gnss | None = None,
-    outages: Sequence[Outage] = (),
 ) -> None:
     """The path of each run over truth and fixes.
 
@@ -90,13 +89,13 @@ def plot_map(
         _aligned_reference(plot, estimate, errors.get(shown))
     else:
         _references(plot, recording, held_out, rejected_fixes(estimate))
-    rings = ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages))
+    rings = ellipses(estimate, ellipse_rows(estimate, sheet.start_ns, sheet.outages))
     if len(rings):
         x, y = _joined(list(rings)).T
         label = f"{ELLIPSE_SIGMAS:g} sigma of position ({shown})"
         plot.glyph("line", {"x": x, "y": y}, label, colours[shown], "line", line_width=0.8, alpha=0.8)
     for name, one in estimates.items():
-        _run(plot, name, one, colours[name], recording.start_ns, outages, errors.get(name))
+        _run(sheet, plot, name, one, colours[name], errors.get(name))
     away = np.full(len(estimates), np.nan)
     marks = {"x": away, "y": away, "colour": np.array([colours[name] for name in estimates], dtype=object)}
     plot.glyph("scatter", marks, "", None, "dot", name="cursor marks", size=11, line_color=style.NEUTRAL)
@@ -107,27 +106,19 @@ def plot_map(
         plot.dots(known[-1:, 0], known[-1:, 1], "end", style.TRUTH_ON_ANY, "square", 8.0)
 
 
-def _run(
-    plot: Plot,
-    name: str,
-    estimate: Estimate,
-    colour: str,
-    start_ns: int,
-    outages: Sequence[Outage],
-    errors: Errors | None,
-) -> None:
+def _run(sheet: Sheet, plot: Plot, name: str, estimate: Estimate, colour: str, errors: Errors | None) -> None:
     """One path, thick where it has no GNSS; its source has time, error and slip for the cursor."""
     path = estimate.trajectory
     rows = style.thin(len(path), MOST)
-    t = style.seconds(path.t_ns, start_ns)[rows]
+    t = sheet.seconds(path.t_ns)[rows]
     error = np.full(len(rows), np.nan)
     if errors is not None and len(errors.t_ns):
-        known = style.seconds(errors.t_ns, start_ns)
+        known = sheet.seconds(errors.t_ns)
         error = np.interp(t, known, errors.distance_m(), left=np.nan, right=np.nan)
     data = {"x": path.position_m[rows, 0], "y": path.position_m[rows, 1]}
     more = {"t": t, "error": error, "slip": estimate.slip[rows]}
-    for outage in outages:
-        inside = path.position_m[outage.covers(path.t_ns, start_ns)]
+    for outage in sheet.outages:
+        inside = path.position_m[outage.covers(path.t_ns, sheet.start_ns)]
         if len(inside):
             plot.line(inside[:, 0], inside[:, 1], name, colour, width=5.0, alpha=0.4)
     plot.glyph("line", data, name, colour, "line", name=f"run {name}", more=more, line_width=1.8)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
 
@@ -58,11 +58,12 @@ class Sheet:
     Args:
         duration_s: length of the common time axis.
         outages: stretches without GNSS, shaded in each figure over time.
+        start_ns: start of the recording, from which that axis counts.
     """
 
-    def __init__(self, duration_s: float = 1.0, outages: Sequence[Outage] = ()) -> None:
+    def __init__(self, duration_s: float = 1.0, outages: Sequence[Outage] = (), start_ns: int = 0) -> None:
         self.begin_axis(duration_s)
-        self.outages = outages
+        self.outages, self.start_ns = outages, start_ns
         self.panels: dict[str, Panel] = {}
 
     def begin_axis(self, duration_s: float) -> None:
@@ -73,6 +74,10 @@ class Sheet:
         end = max(duration_s, 1e-3)
         self.time = Range1d(0.0, end, bounds=(-0.02 * end, 1.02 * end), name="time axis")
         self.cursor = Span(dimension="height", line_color="#808080", visible=False, name="cursor line")
+
+    def seconds(self, t_ns: TimesNs) -> Array:
+        """Places (N,) of times (N,) on the time axis."""
+        return np.asarray((t_ns - self.start_ns) * 1e-9)
 
     def add_time(
         self, key: str, label: str, height: int = 190, *, log: bool = False, limits: Any = None

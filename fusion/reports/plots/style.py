@@ -94,11 +94,6 @@ def thin(n: int, most: int = MAX_POINTS, keep: Iterable[int] = ()) -> NDArray[np
     return np.union1d(rows, extra) if len(extra) else rows
 
 
-def seconds(t_ns: NDArray[np.int64], start_ns: int) -> Array:
-    """Seconds (N,) from `start_ns`."""
-    return np.asarray((t_ns - start_ns) * 1e-9)
-
-
 def robust_limits(values: Array, *, include: Sequence[float] = ()) -> tuple[float, float]:
     """Limits that show all but the most extreme 0.5 % at each end."""
     finite = values[np.isfinite(values)]

@@ -113,8 +113,8 @@ def test_the_report_says_what_was_observed_and_what_could_not_be(drive: Any, tmp
 
 def test_the_plot_of_skid_steering_has_a_band_of_two_sigma(drive: Any) -> None:
     d = drive()
-    sheet = Sheet(10.0)
-    plot_skid_steering(sheet, with_states(d.estimate, calibrated=False), d.recording.start_ns)
+    sheet = Sheet(10.0, start_ns=d.recording.start_ns)
+    plot_skid_steering(sheet, with_states(d.estimate, calibrated=False))
     band = sheet.panels["skid_yaw_scale"].figure.renderers[0].data_source.data
     assert band["y2"] - band["y1"] == pytest.approx(4 * 0.05, rel=1e-5)
 

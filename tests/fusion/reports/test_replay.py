@@ -199,13 +199,12 @@ def test_numbers_read_well(value, text):
 
 def test_figures_share_their_time_axis_and_cursor(drive):
     d = drive(seconds=30.0)
-    sheet = Sheet(30.0)
+    sheet = Sheet(30.0, start_ns=d.recording.start_ns)
     errors = score(d.estimate, d.recording, held_out=None, outages=()).errors
     estimates = {"adaptive": d.estimate, "fixed": d.estimate}
-    start = d.recording.start_ns
     plots_map.plot_map(sheet, estimates, "adaptive", d.recording, COLOURS, errors={"adaptive": errors})
-    plots.plot_slip(sheet, estimates, "adaptive", start, COLOURS)
-    plots.plot_weights(sheet, d.estimate, start, marked=d.estimate.changes)
+    plots.plot_slip(sheet, estimates, "adaptive", COLOURS)
+    plots.plot_weights(sheet, d.estimate, marked=d.estimate.changes)
     timed = [p.figure for key, p in sheet.panels.items() if key != "map"]
     assert all(fig.x_range is sheet.time and sheet.cursor in fig.center for fig in timed)
     sources = {r.data_source.name: r.data_source for r in sheet.panels["map"].figure.renderers}
@@ -262,17 +261,16 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
         np.full(len(d.fixes), Fix.NONE, dtype=np.uint8),
     )  # fmt: skip
     recording = dataclasses.replace(d.recording, gnss=none)
-    start = recording.start_ns
     for estimate in (holed, one):
-        sheet = Sheet(10.0, OUTAGES)
+        sheet = Sheet(10.0, OUTAGES, recording.start_ns)
         runs = {"a": estimate}
-        plots.plot_slip(sheet, runs, "a", start, COLOURS)
+        plots.plot_slip(sheet, runs, "a", COLOURS)
         plots.plot_terrain(sheet, estimate, recording)
-        plots.plot_weights(sheet, estimate, start)
-        plots_filter.plot_biases(sheet, estimate, start)
-        plots_filter.plot_innovations(sheet, estimate, start)
+        plots.plot_weights(sheet, estimate)
+        plots_filter.plot_biases(sheet, estimate)
+        plots_filter.plot_innovations(sheet, estimate)
         plots.plot_speeds(sheet, estimate, recording)
-        plots_map.plot_map(sheet, runs, "a", recording, COLOURS, errors={}, held_out=none, outages=OUTAGES)
+        plots_map.plot_map(sheet, runs, "a", recording, COLOURS, errors={}, held_out=none)
         page = json.loads(sheet.json())  # JSON itself knows no NaN
         assert len(page["render"][0]["roots"]) == len(sheet.panels)
 
@@ -284,8 +282,8 @@ def test_a_ground_that_nothing_tells_colours_nothing(drive):
     blank = dataclasses.replace(d.estimate, terrain=known)
     entries = []
     for estimate in (d.estimate, blank):
-        sheet = Sheet(20.0)
-        plots.plot_slip(sheet, {"a": estimate}, "a", d.recording.start_ns, COLOURS)
+        sheet = Sheet(20.0, start_ns=d.recording.start_ns)
+        plots.plot_slip(sheet, {"a": estimate}, "a", COLOURS)
         plots_map.plot_map(sheet, {"a": estimate}, "a", d.recording, COLOURS, errors={})
         entries.append({label for panel in sheet.panels.values() for label in panel.legend})
     assert "on loose_sand" in entries[0]
@@ -347,7 +345,7 @@ def test_a_local_path_is_shown_with_the_reference_moved_onto_it(drive):
     )
     errors = score(d.estimate, d.recording, held_out=None, outages=()).errors
     for estimate, position in ((local, moved), (d.estimate, path.position_m)):
-        sheet = Sheet(40.0)
+        sheet = Sheet(40.0, start_ns=d.recording.start_ns)
         given = {"adaptive": errors}
         plots_map.plot_map(sheet, {"adaptive": estimate}, "adaptive", d.recording, COLOURS, errors=given)
         names = ("map/reference, moved to the start", "map/truth")
