@@ -5,16 +5,8 @@ from typing import Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    AddressOption,
-    BackendOption,
-    JobsOption,
-    check_backend,
-    processes,
-    progress_bar,
-    read_json,
-)
 from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
@@ -28,9 +20,9 @@ OUTPUT = Output(
 def benchmark(
     out: Path,
     quick: bool = False,
-    jobs: JobsOption = None,
-    backend: BackendOption = "loky",
-    address: AddressOption = None,
+    jobs: common.JobsOption = None,
+    backend: common.BackendOption = "loky",
+    address: common.AddressOption = None,
     seeds: Annotated[
         int | None,
         typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False),
@@ -60,7 +52,7 @@ def benchmark(
         write_document,
     )
 
-    check_backend(backend, address)
+    common.check_backend(backend, address)
     plan = BenchmarkPlan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
     words += [f"--seeds {seeds}"] if seeds else []
@@ -69,13 +61,13 @@ def benchmark(
     origin = origin_of(plan, command)
     if docs is not None:
         document_head(docs)  # refuse now, not after hours
-    with progress_bar("benchmark") as progress:
+    with common.progress_bar("benchmark") as progress:
         result = run_benchmark(
-            plan, out, jobs=processes(jobs), backend=backend, address=address, progress=progress
+            plan, out, jobs=common.processes(jobs), backend=backend, address=address, progress=progress
         )
     origin = at_the_end(origin)
     made = write_benchmark(out, result, origin)
     if docs is not None:
         write_document(docs, made, result, origin)
     lines = [line for table in made[:3] for line in [*table.markdown(), ""]]
-    return Result(lines, f"report: {out / 'report.html'}", read_json(out / "benchmark.json"))
+    return Result(lines, f"report: {out / 'report.html'}", common.read_json(out / "benchmark.json"))

@@ -7,17 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    HowRead,
-    command_line,
-    load_rig,
-    parse_pairs,
-    progress_bar,
-    read_json,
-    refuse_impossible,
-    refuse_no_yaml,
-)
 from terrafusion.fusion.cli.outputs import Output
 from terrafusion.fusion.cli.usage import refuse_options
 
@@ -63,7 +54,7 @@ def calibrate(
     payload_kg: float = 0.0,
     suggest: bool = False,
     *,
-    how: HowRead,
+    how: common.HowRead,
 ) -> Result:
     """Fit soil and vehicle parameters to logs, with their sigma and what the logs cannot identify.
 
@@ -108,14 +99,14 @@ def calibrate(
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
     vehicle = vehicle or "elevate"
-    recordings = how.open_all(logs, load_rig(vehicle))
-    with progress_bar("calibrating") as progress:
+    recordings = how.open_all(logs, common.load_rig(vehicle))
+    with common.progress_bar("calibrating") as progress:
         found = fit(
             recordings, vehicle, soils, split(parameters) or PARAMETERS, priors=priors, source=source,
             truth=truth, robust=robust, channels=split(channels) or None, window_s=window_s,
             slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
         )  # fmt: skip
-    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command_line()})
+    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": common.command_line()})
     return _shown(found, vehicle, out, suggest)
 
 
@@ -133,22 +124,22 @@ def _shown(found: Calibration, vehicle: str, out: Path, suggest: bool) -> Result
     from terrafusion.twin.model.vehicle import load_vehicle
 
     lines = summary(found) + [one.sentence() for one in (suggestions(found) if suggest else ())]
-    document = read_json(out / "calibration.json")
+    document = common.read_json(out / "calibration.json")
     return Result(lines, f"written to {out}", document, vehicle=load_vehicle(vehicle))
 
 
-def _sensors(logs: list[str], vehicle: str | None, how: HowRead, out: Path) -> Result:
+def _sensors(logs: list[str], vehicle: str | None, how: common.HowRead, out: Path) -> Result:
     """Learn the sensor numbers of a robot, and write its file."""
     import dataclasses
 
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors
 
-    refuse_no_yaml(out)
-    recordings = how.open_all(logs, load_rig(vehicle))
+    common.refuse_no_yaml(out)
+    recordings = how.open_all(logs, common.load_rig(vehicle))
     for recording in recordings:
-        refuse_impossible(recording.name, recording)
-    with progress_bar("calibrating") as progress:
+        common.refuse_impossible(recording.name, recording)
+    with common.progress_bar("calibrating") as progress:
         found = calibrate_sensors(recordings, vehicle, progress=progress)
     write_robot(out, found)
     numbers = {name: one and dataclasses.asdict(one) for name, one in vars(found.known()).items()}
@@ -167,7 +158,7 @@ def parse_terrain(entries: list[str] | None) -> str | dict[str, str] | None:
         if len(entries) > 1:
             raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
         return entries[0] if entries else None
-    return parse_pairs(entries, "LABEL=SOIL; one soil for all logs stands alone", "--terrain")
+    return common.parse_pairs(entries, "LABEL=SOIL; one soil for all logs stands alone", "--terrain")
 
 
 def named_soils(soils: str | dict[str, str] | None, found: Calibration) -> dict[str, str]:

@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    HowRead,
-    LogArgument,
-    VehicleOption,
-    clock_accepted,
-    load_rig,
-    refuse_impossible,
-    rig_of,
-    warn_unused,
-    write_log,
-)
 from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
@@ -29,11 +19,11 @@ OUTPUT = Output("A name ending in .mcap, or a folder.", LOG_FILES, mark=None)
 
 
 def convert(
-    log: LogArgument,
+    log: common.LogArgument,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A name ending in .mcap, or a folder.")],
-    vehicle: VehicleOption = None,
+    vehicle: common.VehicleOption = None,
     *,
-    how: HowRead,
+    how: common.HowRead,
     apply_fixes: bool = False,
 ) -> Result:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
@@ -56,12 +46,12 @@ def convert(
     from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.readers import open_recording
 
-    rig = load_rig(vehicle)
+    rig = common.load_rig(vehicle)
     recording = open_recording(log, **replace(how, repair_clock=how.repair_clock or apply_fixes).options(rig))
-    warn_unused(log, [recording])
+    common.warn_unused(log, [recording])
     if how.repair_clock:
-        recording = clock_accepted(recording)
-    rig = rig_of(recording, rig)
+        recording = common.clock_accepted(recording)
+    rig = common.rig_of(recording, rig)
     if vehicle is not None:
         recording = replace(recording, vehicle=vehicle)
     lines = [f"note: {note}" for note in recording.notes]
@@ -70,8 +60,8 @@ def convert(
         recording, repaired = repair(recording, rig)
         lines += [f"repaired: {_line(finding)}" for finding in repaired]
     if out.suffix == ".mcap":
-        refuse_impossible(log, recording)  # their latitudes would be nonsense
-    unseen = write_log(recording, out, rig)
+        common.refuse_impossible(log, recording)  # their latitudes would be nonsense
+    unseen = common.write_log(recording, out, rig)
     lines += [f"not in standard messages: {part}" for part in unseen]
     left = [one for one in run_checks(recording, rig) if apply_fixes or one.severity == "error"]
     lines += [f"{one.severity}: {_line(one)}{_why_left(one, apply_fixes)}" for one in left]

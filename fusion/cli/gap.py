@@ -7,15 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.calibrate import parse_terrain, split
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    HowRead,
-    command_line,
-    load_rig,
-    progress_bar,
-    read_json,
-)
 from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
@@ -74,7 +68,7 @@ def gap(
     seed: Annotated[int, typer.Option(min=0, help="Of replicates.")] = 0,
     explain: ExplainOption = None,
     *,
-    how: HowRead,
+    how: common.HowRead,
 ) -> Result:
     """Diagnose where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
@@ -97,9 +91,9 @@ def gap(
     from terrafusion.twin.gap.diagnose import diagnose
     from terrafusion.twin.model.vehicle import load_vehicle
 
-    rig = load_rig(vehicle)
+    rig = common.load_rig(vehicle)
     judged, normal = (_opened_by_name(names, how, rig) for names in (runs, reference or []))
-    with progress_bar("comparing") as progress:
+    with common.progress_bar("comparing") as progress:
         found = diagnose(
             judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
             effects=None if effects is None else split(effects), significance=significance, source=source,
@@ -111,16 +105,16 @@ def gap(
 
         scores = estimator_gap(found, judged, normal, estimator_scorer(vehicle), seed)
     compared = [] if scores is None else [_line(score) for score in scores[0]]
-    write_diagnosis(out, found, {"command": command_line()}, scores)
+    write_diagnosis(out, found, {"command": common.command_line()}, scores)
     changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
     written = write_vehicle if changes and found.verdict.named else None
     lines = answer(found, out, written)
-    document = read_json(out / "diagnosis.json")
+    document = common.read_json(out / "diagnosis.json")
     more, short = [*changes, *details(found)], f"{verdict_line(found)} Written to {out}"
     return Result([*compared, *lines], "", document, details=more, short=short)
 
 
-def _opened_by_name(names: list[str], how: HowRead, rig: Rig | None) -> list[Recording]:
+def _opened_by_name(names: list[str], how: common.HowRead, rig: Rig | None) -> list[Recording]:
     """The logs, each called as it was given: drives of one scenario share the name in their files."""
     import dataclasses
 

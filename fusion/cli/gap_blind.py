@@ -7,15 +7,8 @@ from typing import Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    AddressOption,
-    BackendOption,
-    check_backend,
-    command_line,
-    progress_bar,
-    read_json,
-)
 from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
@@ -42,8 +35,8 @@ def gap_blind(
     ] = 1.0,
     jobs: Annotated[int, typer.Option(min=1, help="Trials that are diagnosed at once.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
-    backend: BackendOption = "loky",
-    address: AddressOption = None,
+    backend: common.BackendOption = "loky",
+    address: common.AddressOption = None,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="Begin no trial later, and score those answered by then.")
     ] = None,
@@ -76,10 +69,10 @@ def gap_blind(
 
     if quick and share < 1.0:
         raise typer.BadParameter("a quick check has its own size", param_hint="--share")
-    check_backend(backend, address)
+    common.check_backend(backend, address)
     # Processes, or threads inside.
     judged = partial(diagnose, jobs=1) if jobs > 1 or backend == "dask" else diagnose
-    with progress_bar("diagnosing") as progress:
+    with common.progress_bar("diagnosing") as progress:
         scores = run_blind_check(
             out,
             judged,
@@ -91,5 +84,5 @@ def gap_blind(
             opponent=joint_least_squares if opponent else None,
             minutes=math.inf if minutes is None else minutes,
         )
-    write_blind(out, scores, {"command": command_line()})
-    return Result(summary(scores), f"written to {out}", read_json(out / "blind.json"))
+    write_blind(out, scores, {"command": common.command_line()})
+    return Result(summary(scores), f"written to {out}", common.read_json(out / "blind.json"))

@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    HowRead,
-    LogArgument,
-    command_line,
-    parse_topics,
-    progress_bar,
-    refuse_no_yaml,
-)
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
@@ -28,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def init(
-    log: LogArgument,
+    log: common.LogArgument,
     out: Path = Path("my_robot.yaml"),
     vehicle_name: str | None = None,
     drive: str | None = None,
@@ -40,7 +33,7 @@ def init(
     mass: str | None = None,
     no_verdict: bool = False,
     *,
-    how: HowRead,
+    how: common.HowRead,
 ) -> Result:
     """Write the vehicle file of a robot from its first log, and replay the log with it.
 
@@ -90,12 +83,12 @@ def init(
     how.options(None)  # reports wrong usage before anything is read
     first_log = _FirstLog(log, how)
     with decoded_once():
-        first_log.topics = choose_sensors(log, parse_topics(how.topic))
+        first_log.topics = choose_sensors(log, common.parse_topics(how.topic))
         first = first_log.read(generic_rig())
         _refuse_own_base(out, base_of(first))
         print_lines(contents_lines(first))
         answers = ask(answers, first_log.topics)
-        with progress_bar("calibrating the sensors") as progress:
+        with common.progress_bar("calibrating the sensors") as progress:
             found = first_vehicle(first_log.read, first, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
@@ -112,7 +105,7 @@ def _answers(out: Path, vehicle_name: str | None, **texts: str | None) -> Answer
     """What the options say of the robot, by the names of the vehicle file."""
     from terrafusion.fusion.init.answers import Answers
 
-    refuse_no_yaml(out)
+    common.refuse_no_yaml(out)
     given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
     return Answers(vehicle_name or out.stem, **given)
 
@@ -122,7 +115,7 @@ class _FirstLog:
     """The log and how it is read, with the topics chosen so far."""
 
     log: str
-    how: HowRead
+    how: common.HowRead
     topics: dict[str, str] = field(default_factory=dict)
     held: tuple[Any, Recording] | None = None
 
@@ -182,7 +175,7 @@ def _write(out: Path, log: str, found: FirstVehicle) -> None:
     draft, base = found.draft, str(found.draft["extends"].value)
     if Path(base).is_absolute():
         draft = draft | {"extends": replace(draft["extends"], value=seen_from(out, Path(base)))}
-    about = f"Vehicle file of the log '{found.recording.name}', written by: {command_line()}"
+    about = f"Vehicle file of the log '{found.recording.name}', written by: {common.command_line()}"
     write_draft(out, draft, about)
 
 
@@ -200,6 +193,6 @@ def _verdict(found: FirstVehicle, out: Path) -> Verdict:
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.replay import replay
 
-    with progress_bar("replaying") as progress, errors_of(found.recording.name):
+    with common.progress_bar("replaying") as progress, errors_of(found.recording.name):
         result = replay(found.recording, vehicle=out, findings=found.findings, progress=progress)
     return result.verdict

@@ -3,27 +3,16 @@
 from pathlib import Path
 from typing import Any
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    ColumnsOption,
-    HowRead,
-    LogArgument,
-    StampsOption,
-    TopicOption,
-    VehicleOption,
-    command_line,
-    load_rig,
-    rig_of,
-    warn_unused,
-)
 
 
 def inspect(
-    log: LogArgument,
-    vehicle: VehicleOption = None,
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
-    columns: ColumnsOption = None,
+    log: common.LogArgument,
+    vehicle: common.VehicleOption = None,
+    topic: common.TopicOption = None,
+    stamps: common.StampsOption = "header",
+    columns: common.ColumnsOption = None,
     report: Path | None = None,
 ) -> Result:
     """Show the contents of a log, measures between its channels, and the findings of the log checks.
@@ -52,7 +41,7 @@ def inspect(
     if report is not None:
         from terrafusion.fusion.reports.inspect import write_inspection
 
-        write_inspection(report, page, [text for _, text in contents_lines(page)], command_line())
+        write_inspection(report, page, [text for _, text in contents_lines(page)], common.command_line())
     done = "" if report is None else f"report: {report}"
     failed = any(finding["severity"] == "error" for finding in page.get("findings", ()))
     return Result(list(page_lines(page)), done, page, int(failed), short=_found(page))
@@ -78,11 +67,11 @@ def inspected(
     from terrafusion.datasets.checks.summary import summarise, summarise_all
     from terrafusion.datasets.readers import open_recordings
 
-    rig = load_rig(vehicle)
-    recordings = open_recordings(log, **HowRead(topic, stamps, columns, True).options(rig))
-    warn_unused(log, recordings)
-    findings = [run_checks(recording, rig_of(recording, rig)) for recording in recordings]
-    measures = measure(recordings, rig_of(recordings[0], rig))
+    rig = common.load_rig(vehicle)
+    recordings = open_recordings(log, **common.HowRead(topic, stamps, columns, True).options(rig))
+    common.warn_unused(log, recordings)
+    findings = [run_checks(recording, common.rig_of(recording, rig)) for recording in recordings]
+    measures = measure(recordings, common.rig_of(recordings[0], rig))
     if len(recordings) == 1:
         return summarise(recordings[0], measures, findings[0])
     names = {recording.name.rpartition("#")[0] for recording in recordings}

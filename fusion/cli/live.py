@@ -9,17 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    StampsOption,
-    TopicOption,
-    VehicleOption,
-    check_mode,
-    check_stamps,
-    load_rig,
-    parse_point,
-    parse_topics,
-)
 from terrafusion.fusion.cli.usage import refuse_options
 
 if TYPE_CHECKING:
@@ -34,11 +25,11 @@ LogArgument = Annotated[
 
 def live(
     log: LogArgument = None,
-    vehicle: VehicleOption = None,
+    vehicle: common.VehicleOption = None,
     realtime: bool = False,
     mode: str = "adaptive",
-    topic: TopicOption = None,
-    stamps: StampsOption = "header",
+    topic: common.TopicOption = None,
+    stamps: common.StampsOption = "header",
     domain: int | None = None,
     loopback: bool = False,
     reliable: bool = False,
@@ -78,10 +69,10 @@ def live(
     """
     from terrafusion.fusion.live.node import LiveOptions
 
-    check_mode(mode)
-    origin = parse_point(datum, "LAT,LON,HEIGHT", "--datum")
+    common.check_mode(mode)
+    origin = common.parse_point(datum, "LAT,LON,HEIGHT", "--datum")
     options = LiveOptions(
-        vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=origin,
+        vehicle, mode, common.parse_topics(topic), common.check_stamps(stamps), frequency=rate, datum=origin,
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
     )  # fmt: skip
     of_a_robot = {
@@ -162,7 +153,7 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     from terrafusion.fusion.live.loop import live_estimator, run, verdict_of
 
     recording = open_recording(
-        log, rig=load_rig(options.vehicle), topics=dict(options.topics), stamps=options.stamps
+        log, rig=common.load_rig(options.vehicle), topics=dict(options.topics), stamps=options.stamps
     )
     newest: list[State] = []
 

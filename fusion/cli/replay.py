@@ -9,18 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    HowRead,
-    LogArgument,
-    VehicleOption,
-    check_mode,
-    command_line,
-    load_rig,
-    progress_bar,
-    read_json,
-    refuse_errors,
-)
 from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
@@ -57,10 +47,10 @@ DeclinationOption = Annotated[
 
 
 def replay(
-    log: LogArgument,
+    log: common.LogArgument,
     out: Path,
     mode: str = "adaptive",
-    vehicle: VehicleOption = None,
+    vehicle: common.VehicleOption = None,
     policy: Path | None = None,
     batch: bool = False,
     calibrate: bool = False,
@@ -71,7 +61,7 @@ def replay(
     declination: DeclinationOption = None,
     grounds: Path | None = None,
     *,
-    how: HowRead,
+    how: common.HowRead,
 ) -> Result:
     """Estimate a recorded drive as it would have run live, and score it.
 
@@ -105,7 +95,7 @@ def replay(
     outages = [_outage(text) for text in gnss_outage or []]
     memory = None if grounds is None else read_grounds(grounds)
     recording, findings = _opened(log, vehicle, how, calibrate)
-    with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
+    with common.progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording, vehicle=vehicle, mode=mode, policy=policy, outages=outages, batch=batch,
             magnetometer=magnetometer or declination is not None,
@@ -131,16 +121,18 @@ def _check_usage(mode: str, rerun: Path | None) -> None:
     """Refuse an unknown mode, and a file for Rerun where that is not installed."""
     from terrafusion.fusion.reports.rerun_log import require_rerun
 
-    check_mode(mode)
+    common.check_mode(mode)
     if rerun is not None:
         require_rerun()
 
 
-def _opened(log: str, vehicle: str | None, how: HowRead, calibrate: bool) -> tuple[Recording, list[Finding]]:
+def _opened(
+    log: str, vehicle: str | None, how: common.HowRead, calibrate: bool
+) -> tuple[Recording, list[Finding]]:
     """The log and the findings of the log checks; one whose numbers would mislead is refused."""
-    rig = load_rig(vehicle)
+    rig = common.load_rig(vehicle)
     recording = how.open(log, rig)
-    return recording, refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
+    return recording, common.refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
 
 
 def _write(
@@ -153,7 +145,7 @@ def _write(
 
     if grounds is not None and result.grounds is not None:
         save_grounds(result.grounds, grounds)
-    write_replay(out, result, {"command": command_line()})
+    write_replay(out, result, {"command": common.command_line()})
     unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
@@ -166,7 +158,7 @@ def _shown(result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[s
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
     done = f"written to {out}"
     short = f"{result.verdict.lines()[0]}; {done}"
-    return Result(lines, done, read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
+    return Result(lines, done, common.read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
 
 
 def _warning(finding: Finding, learned: Sequence[NumberAfterDrive]) -> str:

@@ -71,10 +71,8 @@ def _versions() -> Iterator[Check]:
     versions = versions_of(("gtsam", "casadi", "numpy", "scipy", "pandas"))
     missing = [name for name, version in versions.items() if version == "not installed"]
     text = ", ".join(f"{name} {version}" for name, version in versions.items())
-    if missing:
-        yield Check("versions", "broken", text, f"pip install {' '.join(missing)}")
-    else:
-        yield Check("versions", "ok", text)
+    remedy = f"pip install {' '.join(missing)}" if missing else ""
+    yield Check("versions", "broken" if missing else "ok", text, remedy)
 
 
 def _compiler() -> Check:
@@ -148,9 +146,5 @@ def _extras() -> Iterator[Check]:
         if importlib.util.find_spec(module) is not None:
             yield Check(f"extra {extra}", "ok", purpose)
         else:
-            yield Check(
-                f"extra {extra}",
-                "note",
-                f"not installed, gives {purpose}",
-                f"pip install 'terrafusion[{extra}]'",
-            )
+            remedy = f"pip install 'terrafusion[{extra}]'"
+            yield Check(f"extra {extra}", "note", f"not installed, gives {purpose}", remedy)

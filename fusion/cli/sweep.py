@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
-from terrafusion.fusion.cli.common import (
-    AddressOption,
-    BackendOption,
-    JobsOption,
-    check_backend,
-    command_line,
-    processes,
-    progress_bar,
-    read_json,
-)
 from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
@@ -35,9 +26,9 @@ OUTPUT = Output(
 def sweep(
     sweep: Annotated[str, typer.Argument(help="Name of a built-in sweep, or a YAML file.")],
     out: Path,
-    jobs: JobsOption = None,
-    backend: BackendOption = "loky",
-    address: AddressOption = None,
+    jobs: common.JobsOption = None,
+    backend: common.BackendOption = "loky",
+    address: common.AddressOption = None,
     max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html.")] = True,
     recordings: list[str] | None = None,
@@ -59,7 +50,7 @@ def sweep(
     from terrafusion.twin.sweep.recordings import check_runs, write_recordings
     from terrafusion.twin.sweep.run import run_sweep
 
-    check_backend(backend, address)
+    common.check_backend(backend, address)
     if recordings_format not in ("folder", "mcap"):
         raise typer.BadParameter(
             f"'{recordings_format}' is neither 'folder' nor 'mcap'", param_hint="--recordings-format"
@@ -67,27 +58,31 @@ def sweep(
     plan = load_sweep(sweep)
     chosen = _numbers(recordings or [], plan)
     check_runs(plan, chosen)
-    count = processes(jobs)
+    count = common.processes(jobs)
     print(f"{plan.name}: {plan.design()}", flush=True)
-    with progress_bar(f"sweep {plan.name}") as progress:
+    with common.progress_bar(f"sweep {plan.name}") as progress:
         table = run_sweep(
             plan, out, jobs=count, backend=backend, address=address, max_runs=max_runs, progress=progress
         )
     failures = []
     if chosen:
-        with progress_bar("recordings") as progress:
+        with common.progress_bar("recordings") as progress:
             failures = write_recordings(
                 plan, chosen, out / "recordings", form=recordings_format, jobs=count, progress=progress
             )
     if plots:
         from terrafusion.fusion.reports.sweep import write_sweep_report
 
-        write_sweep_report(out, plan, table, {"command": command_line()})
+        write_sweep_report(out, plan, table, {"command": common.command_line()})
     statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))
     lines = [*summary_lines(statuses, errors), *failures]
     all_failed = bool(statuses) and set(statuses) == {"failed"}
     return Result(
-        lines, f"written to {out}", read_json(out / "sweep.json"), int(all_failed), vehicle=plan.vehicle
+        lines,
+        f"written to {out}",
+        common.read_json(out / "sweep.json"),
+        int(all_failed),
+        vehicle=plan.vehicle,
     )
 
 

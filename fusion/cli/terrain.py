@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result, add_command
-from terrafusion.fusion.cli.common import (
-    AddressOption,
-    BackendOption,
-    JobsOption,
-    check_backend,
-    processes,
-    progress_bar,
-)
 from terrafusion.fusion.cli.outputs import Output, parts_of
 from terrafusion.fusion.cli.usage import CommandGroup
 
@@ -39,9 +32,9 @@ def train(
         int | None,
         typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False),
     ] = None,
-    jobs: JobsOption = None,
-    backend: BackendOption = "loky",
-    address: AddressOption = None,
+    jobs: common.JobsOption = None,
+    backend: common.BackendOption = "loky",
+    address: common.AddressOption = None,
 ) -> Result:
     """Train the terrain model on simulated runs, or a classifier of one robot's grounds on its labelled logs.
 
@@ -52,7 +45,7 @@ def train(
     Example: terrafusion terrain train --out model.yaml
     Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
-    check_backend(backend, address)
+    common.check_backend(backend, address)
     if logs:
         no_seeds(seeds)
         return train_on_logs(logs, out)
@@ -62,7 +55,7 @@ def train(
     plan = TrainingPlan() if seeds is None else TrainingPlan(seeds=seeds)
     with progress("runs", plan.runs()) as tick:
         model, scores = run(
-            plan, tick, jobs=processes(jobs), backend=backend, address=address, parts=parts_of(out)
+            plan, tick, jobs=common.processes(jobs), backend=backend, address=address, parts=parts_of(out)
         )
     write_model(model, out)
     done = f"temperature {model.temperature:g}; inputs {model.inputs_sha256[:16]}; written to {out}"
@@ -190,7 +183,7 @@ def score_lines(name: str, scores: DetectorScores) -> list[str]:
 @contextlib.contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
     """A progress bar of `total` steps on a terminal; call the value after each step."""
-    with progress_bar(what) as report:
+    with common.progress_bar(what) as report:
         steps = itertools.count(1)
         yield (lambda: report(next(steps) / total)) if report is not None else lambda: None
 

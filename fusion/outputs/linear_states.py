@@ -63,30 +63,21 @@ def calibration(estimate: Estimate) -> list[dict[str, Any]]:
     """
     found = {name: series(estimate, name) for name in CALIBRATION}
     return [
-        {
-            "state": name,
-            "value": float(values[0][-1]),
-            "sigma": float(values[1][-1]),
-            "prior_sigma": CALIBRATION_SIGMA[name],
-            "observed": bool(values[1][-1] < OBSERVED_SHARE * CALIBRATION_SIGMA[name]),
-        }
+        _row(name, float(values[0][-1]), float(values[1][-1]), CALIBRATION_SIGMA[name])
         for name, values in found.items()
         if values is not None
     ]
 
 
+def _row(state: str, value: float, sigma: float, prior_sigma: float) -> dict[str, Any]:
+    observed = sigma < OBSERVED_SHARE * prior_sigma
+    return {"state": state, "value": value, "sigma": sigma, "prior_sigma": prior_sigma, "observed": observed}
+
+
 def learned_rows(numbers: Sequence[NumberAfterDrive]) -> list[dict[str, Any]]:
     """What self-calibration knows at the end, in rows as those of `calibration`, with `corrects`."""
     return [
-        {
-            "state": number.state,
-            "value": number.value,
-            "sigma": number.sigma,
-            "prior_sigma": number.prior_sigma,
-            "observed": number.sigma < OBSERVED_SHARE * number.prior_sigma,
-            "corrects": number.corrects,
-        }
-        for number in numbers
+        _row(one.state, one.value, one.sigma, one.prior_sigma) | {"corrects": one.corrects} for one in numbers
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.metrics.classification import classification_scores
+from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
@@ -35,12 +35,12 @@ class LabelledRoute:
 
 
 @dataclass(frozen=True)
-class DetectorScores:
+class DetectorScores(ClassificationScores):
     """Scores of a detector over routes; only windows in which the robot or its wheels moved count.
 
+    `unknown`, the last class, is right if no other one is.
+
     Attributes:
-        classes: names of the rows and columns of `confusion`, `unknown` last.
-        confusion, macro_f1, ece: as in `ClassificationScores`; `unknown` is right if no other class is.
         unknown_share: share of windows classified as unknown.
         switch_delay_s: median, 95th percentile and largest time from a change of ground to its detection.
         switches_missed: share of patches (of `MIN_SCORED_PATCH_S` and more) whose ground was never detected.
@@ -48,16 +48,11 @@ class DetectorScores:
         update_ms: mean processor time of one update.
     """
 
-    classes: tuple[str, ...]
-    confusion: tuple[tuple[float, ...], ...]
-    macro_f1: float
-    ece: float
     unknown_share: float
     switch_delay_s: tuple[float, float, float]
     switches_missed: float
     false_switches_per_min: float
     update_ms: float
-    windows: int
 
 
 def drawn_patches(runs: Sequence[tuple[Run, str]], rng: np.random.Generator) -> Iterator[tuple[str, Run]]:
@@ -119,16 +114,12 @@ def evaluate(model: TerrainModel, routes: Sequence[LabelledRoute]) -> DetectorSc
     scores = classification_scores(classes, np.concatenate(truths), winner, np.concatenate(confidences))
     quantiles = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
     return DetectorScores(
-        classes=classes,
-        confusion=scores.confusion,
-        macro_f1=scores.macro_f1,
-        ece=scores.ece,
+        **vars(scores),
         unknown_share=float((winner == len(classes) - 1).mean()),
         switch_delay_s=(float(quantiles[0]), float(quantiles[1]), float(quantiles[2])),
         switches_missed=missed / max(len(delays) + missed, 1),
         false_switches_per_min=false / max(scores.windows * UPDATE_S / 60.0, 1e-9),
         update_ms=1e3 * seconds / max(updates, 1.0),
-        windows=scores.windows,
     )
 
 

@@ -60,22 +60,15 @@ def examine(names: Sequence[str], covariance: Array) -> Identifiability:
     """Identifiability from the posterior covariance (P, P) in prior sigmas."""
     precision = np.linalg.inv(covariance)
     ratio, alone = np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(np.diag(precision))
-    status = tuple(
-        IDENTIFIED
-        if whole <= IDENTIFIED_RATIO
-        else COMBINED
-        if single <= IDENTIFIED_RATIO
-        else NOT_IDENTIFIED
-        for whole, single in zip(ratio, alone, strict=True)
-    )
+    known = [ratio <= IDENTIFIED_RATIO, alone <= IDENTIFIED_RATIO]
+    status = tuple(np.select(known, [IDENTIFIED, COMBINED], NOT_IDENTIFIED).tolist())
     values, vectors = np.linalg.eigh(precision - np.eye(len(names)))
     values, vectors = values[::-1], vectors[:, ::-1]
-    weak = [
-        _direction(names, vectors[:, i], 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)))
-        for i in range(len(names))
-        if 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)) > IDENTIFIED_RATIO
-    ]
-    return Identifiability(ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak))
+    ratios = 1.0 / np.sqrt(np.maximum(1.0 + values, 1e-12))
+    weak = [_direction(names, vectors[:, i], ratios[i]) for i in np.flatnonzero(ratios > IDENTIFIED_RATIO)]
+    return Identifiability(
+        ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak)
+    )
 
 
 def _direction(names: Sequence[str], vector: Array, ratio: float) -> Direction:

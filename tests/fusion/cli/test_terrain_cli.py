@@ -34,7 +34,7 @@ def test_a_missing_model_is_a_known_error(tmp_path: Path) -> None:
 def test_scores_are_printed_for_the_grounds_that_occurred(capsys: pytest.CaptureFixture[str]) -> None:
     confusion = ((0.9, 0.1, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     scores = DetectorScores(
-        ("mud", "ice", "unknown"), confusion, 0.9, 0.01, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2, 50
+        ("mud", "ice", "unknown"), 0.9, 0.9, 0.01, confusion, 50, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2
     )
     lines = terrain.score_lines("trial", scores)
     assert lines[0] == "trial: 50 windows"
