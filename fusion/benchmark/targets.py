@@ -5,13 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafusion.fusion.benchmark.compare import (
-    Contrast,
-    Interval,
-    contrasts,
-    median_interval,
-    shares,
-)
+from terrafusion.fusion.benchmark import compare
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE
 from terrafusion.fusion.benchmark.run_score import RunScore
 from terrafusion.fusion.benchmark.twin_runs import FIELD
@@ -36,7 +30,7 @@ class Target:
     limit: float
     most: bool
     found: float | None
-    interval: Interval | None
+    interval: compare.Interval | None
     unit: str = ""
     broken: int = 0
 
@@ -63,7 +57,7 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
     - G9: `adaptive` over `fixed` on field logs, with no replay that fails or diverges.
     """
     out: list[Target] = []
-    against_fixed, against_innovation = contrasts(rows), contrasts(rows, "innovation")
+    against_fixed, against_innovation = compare.contrasts(rows), compare.contrasts(rows, "innovation")
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "mixed"):
         at = ("mixed", plant)
         out += [
@@ -71,7 +65,7 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
             _ratio("G1", 0.75, against_innovation, *at, ADAPTIVE),
             *(
                 Target("G1", f"mixed, {plant}: share of the oracle's gain", 0.70, False, s.share, s.interval)
-                for s in shares(rows)
+                for s in compare.shares(rows)
                 if (s.family, s.plant) == at
             ),
             _ratio("G2", 1.10, against_fixed, *at, "shuffled"),
@@ -113,7 +107,7 @@ def _consistencies(row: RunScore, ground: str) -> tuple[Consistency, ...]:
 
 
 def _ratio(
-    name: str, limit: float, found: Sequence[Contrast], family: str, plant: str, method: str
+    name: str, limit: float, found: Sequence[compare.Contrast], family: str, plant: str, method: str
 ) -> Target:
     what = f"{family}, {plant}: {method}"
     for c in found:
@@ -127,5 +121,5 @@ def _drift(rows: Sequence[RunScore], family: str, plant: str, limit: float) -> T
     own = [row for row in rows if (row.family, row.plant, row.method) == (family, plant, ADAPTIVE)]
     percent = [row.percent for row in own if row.outage_s == LONG_S and row.percent is not None]
     percent += [math.inf for row in own if row.failed]
-    found, interval = median_interval(percent) if percent else (None, None)
+    found, interval = compare.median_interval(percent) if percent else (None, None)
     return Target("G5", what, limit, True, found, interval, "%")

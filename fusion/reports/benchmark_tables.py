@@ -6,15 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.tables import markdown_table, number
-from terrafusion.fusion.benchmark.compare import (
-    LEAST_UNITS,
-    Contrast,
-    Interval,
-    contrasts,
-    groups_of,
-    known_median,
-    shares,
-)
+from terrafusion.fusion.benchmark import compare
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, METHODS
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
 from terrafusion.fusion.benchmark.run_score import RunScore
@@ -49,8 +41,8 @@ class Section:
 def tables(rows: Sequence[RunScore]) -> list[Section]:
     """All tables, the main one first; those without rows are left out."""
     made = (
-        _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(contrasts(rows)), _shares(rows),
-        _nees(pooled_nees(rows)), _field(rows), _failures(rows), _arms(),
+        _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(compare.contrasts(rows)),
+        _shares(rows), _nees(pooled_nees(rows)), _field(rows), _failures(rows), _arms(),
     )  # fmt: skip
     return [table for table in made if table.rows]
 
@@ -64,23 +56,23 @@ def _main(rows: Sequence[RunScore]) -> Section:
     """Median error of the fixed noise, and the ratios to it."""
     methods = [method.name for method in METHODS if method.name != BASELINE]
     lines = []
-    for group, of in _by_method(contrasts(rows)).items():
+    for group, of in _by_method(compare.contrasts(rows)).items():
         if BASELINE in of:
             units = of[BASELINE].units
             head = [group_name(*group), str(units), number(of[BASELINE].error_m)]
             lines.append([*head, *(_ratio(of.get(method), units) for method in methods)])
     about = (
         f"Root mean square position error inside the outage: its median for {BASELINE} (tuned), and for the "
-        f"others the median of the paired ratios to it, with its 95 % interval from {LEAST_UNITS} pairs on. "
-        "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
-        "every drive has labels."
+        "others the median of the paired ratios to it, with its 95 % interval from "
+        f"{compare.LEAST_UNITS} pairs on. Below 1 is better. A replay that failed counts as infinitely "
+        "wrong; in brackets the pairs where not every drive has labels."
     )
     return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *methods), tuple(lines))
 
 
-def _by_method(results: Iterable[Contrast]) -> dict[tuple[str, str], dict[str, Contrast]]:
+def _by_method(results: Iterable[compare.Contrast]) -> dict[tuple[str, str], dict[str, compare.Contrast]]:
     """Family and plant -> method -> contrast."""
-    groups: dict[tuple[str, str], dict[str, Contrast]] = {}
+    groups: dict[tuple[str, str], dict[str, compare.Contrast]] = {}
     for c in results:
         groups.setdefault((c.family, c.plant), {})[c.method] = c
     return groups
@@ -97,8 +89,8 @@ def _targets(results: Iterable[Target]) -> Section:
     ]  # fmt: skip
     about = (
         "Reached or missed: the whole interval is on one side of the limit. Open: it contains the limit, or "
-        f"there is none (below {LEAST_UNITS} drives). G1: {ADAPTIVE} on mixed ground; G2: harm by wrong "
-        "labels, or on firm ground; G5: drift in long outages; G9: field logs, missed by any replay of "
+        f"there is none (below {compare.LEAST_UNITS} drives). G1: {ADAPTIVE} on mixed ground; G2: harm by "
+        "wrong labels, or on firm ground; G5: drift in long outages; G9: field logs, missed by any replay of "
         f"{ADAPTIVE} that fails or diverges; they were in view while the estimator was developed."
     )
     return Section("Targets", about, ("target", "what", "limit", "measured", "verdict"), tuple(lines))
@@ -121,7 +113,7 @@ def _reasons(results: Iterable[Reason]) -> Section:
     return Section("Where adaptive loses", about, heads, tuple(lines))
 
 
-def _wins(results: Iterable[Contrast]) -> Section:
+def _wins(results: Iterable[compare.Contrast]) -> Section:
     methods = [method.name for method in METHODS if method.name != BASELINE]
     groups = _by_method(results)
     lines = [
@@ -133,9 +125,9 @@ def _wins(results: Iterable[Contrast]) -> Section:
 
 
 def _shares(rows: Sequence[RunScore]) -> Section:
-    groups = groups_of(rows)
+    groups = compare.groups_of(rows)
     lines = []
-    for s in shares(rows):
+    for s in compare.shares(rows):
         known = recognised(groups[s.family, s.plant])
         delays = [
             r.switch_s for r in groups[s.family, s.plant] if r.method == ADAPTIVE and r.switch_s is not None
@@ -165,7 +157,7 @@ def _nees(cells: Iterable[PooledConsistency]) -> Section:
     about = (
         "Mean NEES of the position per dimension on each true terrain [95 % interval over drives], inside "
         "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator; with fewer "
-        f"than {LEAST_UNITS} drives the mean alone."
+        f"than {compare.LEAST_UNITS} drives the mean alone."
     )
     heads = ("terrain", "plant, method", "drives", INSIDE, IN_OUTAGE)
     return Section("Consistency", about, heads, tuple(lines))
@@ -180,7 +172,7 @@ def _field(rows: Sequence[RunScore]) -> Section:
             method.name: [row.error_m for row in own if (row.unit, row.method) == (log, method.name)]
             for method in METHODS
         }
-        medians = [number(known_median(of[m.name])) if of[m.name] else "-" for m in METHODS]
+        medians = [number(compare.known_median(of[m.name])) if of[m.name] else "-" for m in METHODS]
         lines.append([log, str(len(of[BASELINE])), *medians])
     about = "Median over the outages of a log, m; against truth, or held-out fixes with their noise."
     return Section("Field logs", about, ("log", "drives", *(method.name for method in METHODS)), tuple(lines))
@@ -200,13 +192,13 @@ def _arms() -> Section:
     return Section("Names", "Arms, families of drives, and plants.", ("name", "is"), tuple(lines))
 
 
-def _ratio(c: Contrast | None, units: int) -> str:
+def _ratio(c: compare.Contrast | None, units: int) -> str:
     if c is None:
         return "-"
     return f"{c.ratio:.2f}{_ends(c.interval, 2)}{f' ({c.units})' if c.units != units else ''}"
 
 
-def _ends(interval: Interval | None, decimals: int | None = None) -> str:
+def _ends(interval: compare.Interval | None, decimals: int | None = None) -> str:
     if interval is None:
         return ""
     low, high = (f"{x:.{decimals}f}" if decimals else number(x) for x in interval)
@@ -214,7 +206,7 @@ def _ends(interval: Interval | None, decimals: int | None = None) -> str:
 
 
 def _cell(cell: PooledConsistency) -> str:
-    if cell.drives < LEAST_UNITS:
+    if cell.drives < compare.LEAST_UNITS:
         return f"{cell.mean:.2f}"
     (low, high), band, sign = cell.interval, cell.band, VERDICT_SIGNS[cell.verdict()]
     return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {sign} {band[0]:.2f}..{band[1]:.2f}"

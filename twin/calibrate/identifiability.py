@@ -66,9 +66,7 @@ def examine(names: Sequence[str], covariance: Array) -> Identifiability:
     values, vectors = values[::-1], vectors[:, ::-1]
     ratios = 1.0 / np.sqrt(np.maximum(1.0 + values, 1e-12))
     weak = [_direction(names, vectors[:, i], ratios[i]) for i in np.flatnonzero(ratios > IDENTIFIED_RATIO)]
-    return Identifiability(
-        ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak)
-    )
+    return Identifiability(ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak))
 
 
 def _direction(names: Sequence[str], vector: Array, ratio: float) -> Direction:
