@@ -148,16 +148,10 @@ def median_interval(values: Sequence[float]) -> tuple[float, Interval | None]:
     middle = float(np.median(ordered))
     if len(ordered) < LEAST_UNITS:
         return middle, None
-    k = _sign_test_rank(len(ordered))
+    from scipy.stats import binom
+
+    k = int(binom.ppf(0.5 * (1.0 - CONFIDENCE), len(ordered), 0.5)) - 1  # values outside, at each end
     return middle, (ordered[k], ordered[-1 - k])
-
-
-def _sign_test_rank(n: int) -> int:
-    """Number of the n ordered values outside the interval of the median, at each end."""
-    tail, k = 0.5**n, 0
-    while 2.0 * (tail := tail + math.comb(n, k + 1) * 0.5**n) <= 1.0 - CONFIDENCE:
-        k += 1
-    return k
 
 
 def _contrast(group: tuple[str, str], errors: Errors, method: str, baseline: str) -> Contrast | None:

@@ -159,7 +159,9 @@ def _aligned_with(
     at, heading = path.at(errors.t_ns)
     heading = heading + float(np.angle(turn))
     place = target[rows].mean() + turn * (at - z[rows].mean()) + point * np.exp(1j * heading)
-    moved = dataclasses.replace(errors, estimate_m=_columns(place), estimate_yaw_rad=heading)
+    moved = dataclasses.replace(
+        errors, estimate_m=np.stack([place.real, place.imag], axis=1), estimate_yaw_rad=heading
+    )
     return (align_start(moved)[0] if aligned else moved).distance_m()
 
 
@@ -207,10 +209,6 @@ def _valid(gnss: Gnss | None) -> Gnss | None:
 
 def _cumulative(t: Array, rate: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
-
-
-def _columns(place: Complex) -> Array:
-    return np.stack([place.real, place.imag], axis=1)
 
 
 def rms(values: Array | None) -> float | None:

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
@@ -15,7 +14,6 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
 
-CONFIDENCE = 0.95
 REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
@@ -31,13 +29,10 @@ class Allan:
     Attributes:
         tau_s: (K,) cluster times, s.
         deviation: (K,) in the unit of the series.
-        low, high: (K,) bounds of its confidence interval (95 %).
     """
 
     tau_s: Array
     deviation: Array
-    low: Array
-    high: Array
 
 
 @dataclass(frozen=True)
@@ -60,14 +55,11 @@ def allan_deviation(values: Array, rate_hz: float, per_octave: int = 2) -> Allan
     """Overlapping Allan deviation of rates (N,) sampled at `rate_hz`, to clusters of a fifth of the series.
 
     sigma^2(tau) = <(theta(t + 2 tau) - 2 theta(t + tau) + theta(t))^2> / (2 tau^2), theta the integral of the
-    rates (IEEE Std 952-1997, annex C). The interval takes the smaller of the degrees of freedom that
-    white noise and a random walk leave (Riley, NIST SP 1065, 2008, table 5).
+    rates (IEEE Std 952-1997, annex C).
 
     Raises:
         ValueError: fewer than 10 values.
     """
-    from scipy.stats import chi2
-
     n = len(values)
     if n < 10:
         raise ValueError(f"{n} values are too few for an Allan deviation")
@@ -78,18 +70,7 @@ def allan_deviation(values: Array, rate_hz: float, per_octave: int = 2) -> Allan
     for k, m in enumerate(sizes.tolist()):
         second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
         deviation[k] = math.sqrt(float(np.mean(second**2)) / 2.0) * rate_hz / m
-    free = np.minimum(*_degrees_of_freedom(n + 1, sizes))
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = (deviation * np.sqrt(free / chi2.ppf(p, free)) for p in (1.0 - tail, tail))
-    return Allan(sizes / rate_hz, deviation, low, high)
-
-
-def _degrees_of_freedom(points: int, sizes: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Of the overlapping Allan variance of so many angles, for rates that are white or a random walk."""
-    n, m = float(points), sizes.astype(float)
-    white = (1.5 * (n - 1.0) / m - 2.0 * (n - 2.0) / n) * 4.0 * m**2 / (4.0 * m**2 + 5.0)
-    walk = (n - 2.0) / m * ((n - 1.0) ** 2 - 3.0 * m * (n - 1.0) + 4.0 * m**2) / (n - 3.0) ** 2
-    return white, walk
+    return Allan(sizes / rate_hz, deviation)
 
 
 def inertial_noise(curves: list[Allan]) -> InertialNoise:

@@ -99,13 +99,17 @@ def _directions(log: PreparedLog, model: Model, plant: Plant, names: Sequence[st
     """The named numbers, then x, y and yaw of a start."""
     effects = [name.removeprefix("effects.") for name in names if name.startswith("effects.")]
     d = Directions.zeros(plant, len(names) + len(POSE), effects)
+    ends = [
+        label for label in log.labels for _ in range(2)
+    ]  # of each ground; those of the route are no knots
+    knots = ends[1:-1] if len(log.labels) > 1 else log.labels
     for m, name in enumerate(names):
         if name.startswith("effects."):
             d.effects[name.removeprefix("effects.")][m] = 1.0
         elif name.startswith("vehicle."):
             d.vehicle[:, m] = model.vehicle_change(name)
         else:
-            for k, label in enumerate(_knot_labels(log)):
+            for k, label in enumerate(knots):
                 d.soil[k, :, m] = model.soil_change(name, label)
     if log.follows:
         d.vehicle[[VEHICLE_PARAMETERS.index(name) for name in FOLLOWING]] = 0.0
@@ -117,13 +121,6 @@ def route_of(log: PreparedLog, model: Model) -> RouteTable:
     vectors = np.array([soil_vector(model.soils[label]) for label in log.labels])
     transition_s = min(TRANSITION_S, 0.8 * float(np.min(np.diff(log.borders), initial=TRANSITION_S)))
     return RouteTable.joined("time", vectors, log.borders, transition_s)
-
-
-def _knot_labels(log: PreparedLog) -> list[str]:
-    """Ground at each knot of `route_of`."""
-    if len(log.labels) == 1:
-        return list(log.labels)
-    return [label for label in log.labels for _ in range(2)][1:-1]
 
 
 def _run(log: PreparedLog, plant: Plant, d: Directions, inputs: Array, start: Array) -> tuple[Array, Array]:

@@ -24,14 +24,6 @@ def _tilted(q: Quantities, uphill: tuple[Any, Any], angle: Any) -> dict[str, Any
     }
 
 
-def _heading(q: Quantities) -> tuple[Any, Any]:
-    return ca.cos(q["yaw"]), ca.sin(q["yaw"])
-
-
-def _to_the_left(q: Quantities) -> tuple[Any, Any]:
-    return -ca.sin(q["yaw"]), ca.cos(q["yaw"])
-
-
 def _blown(q: Quantities, area: Any, air: tuple[Any, Any]) -> dict[str, Any]:
     """Drag of air that moves by `air` (m/s, body axes) on `area` m2, drag coefficient included."""
     x, y = air[0] - q["u"], air[1] - q["v"]
@@ -50,7 +42,7 @@ FORMS = (
     ),
     Form(
         "slope", "along_track", one("rad", 0.03, -0.3, 0.3),
-        {"vehicle": lambda q, e: _tilted(q, _heading(q), e)},
+        {"vehicle": lambda q, e: _tilted(q, (ca.cos(q["yaw"]), ca.sin(q["yaw"])), e)},
         "the ground rises by e wherever the robot heads", "geometry",
     ),
     Form(
@@ -60,7 +52,7 @@ FORMS = (
     ),
     Form(
         "cross_slope", "camber", one("rad", 0.03, -0.3, 0.3),
-        {"vehicle": lambda q, e: _tilted(q, _to_the_left(q), e)},
+        {"vehicle": lambda q, e: _tilted(q, (-ca.sin(q["yaw"]), ca.cos(q["yaw"])), e)},
         "the ground rises by e to the robot's left", "geometry",
     ),
     Form(

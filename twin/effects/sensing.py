@@ -40,10 +40,6 @@ def _drops_when_fast(q: Quantities, share: Any) -> dict[str, Any]:
     return {name: q[name] * (1.0 - lost[name]) for name in WHEEL_SPEEDS}
 
 
-def _turning(q: Quantities) -> Any:
-    return smooth_abs(q["r"], TURN_WIDTH_RADPS) - TURN_WIDTH_RADPS
-
-
 def _warmed(q: Quantities) -> Any:
     return 1.0 - ca.exp(-q["elapsed"] / WARM_UP_S)
 
@@ -119,7 +115,9 @@ FORMS = (
     ),
     Form(
         "gyro_scale", "asymmetry", one("", 0.02, -0.5, 0.5),
-        {"measurement": lambda q, e: _added(q, IMU[:1], (e * _turning(q),))},
+        {"measurement": lambda q, e: _added(
+            q, IMU[:1], (e * (smooth_abs(q["r"], TURN_WIDTH_RADPS) - TURN_WIDTH_RADPS),)
+        )},
         "r + e abs(r)", "scale factor asymmetry (IEEE 528)",
     ),
     Form(

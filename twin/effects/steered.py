@@ -33,13 +33,9 @@ def _corner(w: Mapping[str, Any], share: Any) -> Mapping[str, Any]:
     return {"heading_cos": along / length, "heading_sin": across / length, "path_share": length}
 
 
-def _motor(w: Mapping[str, Any], share: Any) -> Mapping[str, Any]:
-    """Each wheel's own speed on its circle."""
-    return {"command_radps": w["command_radps"] * w["path_share"]}
-
-
 STEERED = Form(
-    "drive", "steered", one("", 1.0, 0.0, 1.0), {"corner": _corner, "motor": _motor},
+    "drive", "steered", one("", 1.0, 0.0, 1.0),
+    {"corner": _corner, "motor": lambda w, share: {"command_radps": w["command_radps"] * w["path_share"]}},
     "a wheel at (x, y) rolls along (1 - k y, s + k x), k = (tan f - tan r) / L, s = (tan f + tan r) / 2",
     "Ackermann geometry", candidate=False,
 )  # fmt: skip

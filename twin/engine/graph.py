@@ -6,7 +6,7 @@ that are the same for the four wheels are found, so that one vector instruction 
 
 import functools
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable
 from dataclasses import dataclass, field
 from operator import add, mul, neg, sub, truediv
 from typing import Any, NamedTuple
@@ -170,13 +170,9 @@ def with_reciprocals(
 def _rewritten(graph: OperationGraph, outputs: Outputs, rule: Any) -> tuple[OperationGraph, Outputs]:
     new = OperationGraph()
     moved: dict[int, int] = {}
-    for n in graph.reached(_all(outputs)):
+    for n in graph.reached(n for nodes in outputs.values() for n in nodes):
         moved[n] = rule(new, n, tuple(moved[a] for a in graph.args[n]))
     return new, {name: [moved[n] for n in nodes] for name, nodes in outputs.items()}
-
-
-def _all(outputs: Outputs) -> Sequence[int]:
-    return [n for nodes in outputs.values() for n in nodes]
 
 
 class _Trait(NamedTuple):
