@@ -104,11 +104,7 @@ class Knowledge:
 
 
 def assumed(
-    bias_sigma_radps: float,
-    yaw_of_wheels: bool,
-    slip_spread: float,
-    slip_time_s: float,
-    skids: bool = False,
+    bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float, slip_time_s: float, skids: bool = False
 ) -> Knowledge:
     """What is known of a robot before it drives; `skids`: its wheels or tracks skid in every turn."""
     sigma = np.array(

@@ -16,13 +16,7 @@ from scipy import linalg
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.motion import Complex, MotionSegment, Path, dead_reckoned
-from terrafusion.fusion.calibration.numbers import (
-    ANTENNA_X,
-    ANTENNA_Y,
-    GNSS_DELAY,
-    NUMBERS,
-    WHEEL_SCALE,
-)
+from terrafusion.fusion.calibration.numbers import ANTENNA_X, ANTENNA_Y, GNSS_DELAY, NUMBERS, WHEEL_SCALE
 from terrafusion.fusion.calibration.slip import SlipMoments
 
 Places = NDArray[np.intp]

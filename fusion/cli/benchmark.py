@@ -24,8 +24,7 @@ def benchmark(
     backend: common.BackendOption = "loky",
     address: common.AddressOption = None,
     seeds: Annotated[
-        int | None,
-        typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False),
+        int | None, typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False)
     ] = None,
     only: list[str] | None = None,
     docs: Path | None = None,

@@ -54,8 +54,7 @@ ColumnsOption = Annotated[
     typer.Option("--columns", metavar="FILE", help="YAML that describes the columns of a plain table."),
 ]
 RepairClockOption = Annotated[
-    bool,
-    typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log."),
+    bool, typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log.")
 ]
 JobsOption = Annotated[
     int | None,

@@ -13,15 +13,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for blind.json, report.html and the labels.",
-    (
-        "config.json",
-        "labels.*",
-        "commitment.json",
-        "answers.*",
-        "oracle.jsonl",
-        "blind.json",
-        "report.html",
-    ),
+    ("config.json", "labels.*", "commitment.json", "answers.*", "oracle.jsonl", "blind.json", "report.html"),
     ("labels.salt",),
     goes_on=True,
 )

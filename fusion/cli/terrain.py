@@ -29,8 +29,7 @@ def train(
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: simulated runs.")
     ] = None,
     seeds: Annotated[
-        int | None,
-        typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False),
+        int | None, typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False)
     ] = None,
     jobs: common.JobsOption = None,
     backend: common.BackendOption = "loky",
@@ -83,8 +82,7 @@ def evaluate(
     ] = None,
     model: Path | None = None,
     seeds: Annotated[
-        int | None,
-        typer.Option(min=1, max=1000, help="New seeds of simulated runs (1).", show_default=False),
+        int | None, typer.Option(min=1, max=1000, help="New seeds of simulated runs (1).", show_default=False)
     ] = None,
     test: list[str] | None = None,
     out: Path | None = None,

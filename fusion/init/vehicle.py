@@ -84,10 +84,7 @@ def generic_rig() -> Rig:
 
 
 def first_vehicle(
-    open_log: Open,
-    first: Recording,
-    answers: Answers,
-    progress: Callable[[float], None] | None = None,
+    open_log: Open, first: Recording, answers: Answers, progress: Callable[[float], None] | None = None
 ) -> FirstVehicle:
     """Measure what the log shows, and lay out the file.
 

@@ -14,10 +14,7 @@ from terrafusion.twin.model.vehicle_file import read_vehicle
 
 
 def write_files(
-    calibration: Calibration,
-    out: Path,
-    vehicle: str | Path,
-    soils: Mapping[str, str | Path] | None = None,
+    calibration: Calibration, out: Path, vehicle: str | Path, soils: Mapping[str, str | Path] | None = None
 ) -> list[Path]:
     """Write `vehicle.yaml`, and `soil.yaml` (or `soil_NAME.yaml` for several), which load as they are.
 
