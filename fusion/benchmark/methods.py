@@ -102,10 +102,10 @@ def known_labels(labels: GroundLabels | None) -> GroundLabels | None:
     return labels if labels is not None and known & set(labels.names) else None
 
 
-def shuffled(labels: GroundLabels, policy: Policy, seed: int, seconds: float = 3600.0) -> GroundLabels:
-    """Random labels from the first true one on, a new class every `SHUFFLE_S`."""
+def shuffled(labels: GroundLabels, policy: Policy, seed: int) -> GroundLabels:
+    """Random labels for an hour from the first true one on, a new class every `SHUFFLE_S`."""
     known = [name for name in policy.names() if name != UNKNOWN]
-    count = math.ceil(seconds / SHUFFLE_S)
+    count = math.ceil(3600.0 / SHUFFLE_S)
     drawn = np.random.default_rng(seed).integers(len(known), size=count)
     times = tuple(labels.t_ns[0] + k * round(SHUFFLE_S * 1e9) for k in range(count))
     return GroundLabels(times, tuple(known[i] for i in drawn))

@@ -68,7 +68,7 @@ def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> 
     return cells
 
 
-def mean_interval(values: Array, seed: int = 0) -> tuple[float, float]:
+def mean_interval(values: Array) -> tuple[float, float]:
     """Interval of the mean of independent `values` (M,); a point where there is one value."""
-    means = values[resampled_rows(len(values), RESAMPLES, seed)].mean(axis=1)
+    means = values[resampled_rows(len(values), RESAMPLES, 0)].mean(axis=1)
     return percentile_interval(means, 50.0 * (1.0 - CONFIDENCE))

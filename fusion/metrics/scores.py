@@ -194,14 +194,14 @@ def score(
     )
 
 
-def rpe_percent(errors: Errors, lengths_m: Sequence[float] = RPE_LENGTHS_M) -> dict[str, float | None]:
+def rpe_percent(errors: Errors) -> dict[str, float | None]:
     """Mean relative position error over all pairs a length of path apart, percent of that path.
 
     One number for each length; None if the run is shorter.
     """
     path = errors.path_m()
     out: dict[str, float | None] = {}
-    for length in lengths_m:
+    for length in RPE_LENGTHS_M:
         first, last = path_pairs(errors, length, path)
         error = relative_error_m(errors, first, last)
         out[f"{length:g}"] = _mean(100.0 * error / (path[last] - path[first]))

@@ -33,7 +33,6 @@ class ScoreRow:
 
     label: str
     values: tuple[float | None, ...]
-    digits: int = 3
     goal: str = ""
     about: str = ""
     baselines: tuple[float | None, ...] = (None, None)
@@ -68,11 +67,11 @@ class ScoreRow:
 
     def text(self, i: int) -> str:
         """The number of run `i` as shown."""
-        return number(self.values[i], self.digits)
+        return number(self.values[i])
 
     def baseline_text(self, k: int) -> str:
         """The number of a baseline as shown."""
-        return number(self.baselines[k], self.digits)
+        return number(self.baselines[k])
 
     def _cost(self, value: float | None) -> float | None:
         if value is None or self.goal != "one":
@@ -96,7 +95,7 @@ def score_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
     ate = f"ATE: horizontal, against {reference}; aligned only at the start of a drive without GNSS"
     ates = tuple(run["ate_m"] for run in runs)
     baselines = _baselines(runs[0].get("baselines"))
-    rows = [ScoreRow("Position error, RMS, m", ates, 3, "low", ate if reference else "", baselines)]
+    rows = [ScoreRow("Position error, RMS, m", ates, "low", ate if reference else "", baselines)]
     for i, length in enumerate(runs[0]["rpe_percent"]):
         values = tuple(run["rpe_percent"].get(length) for run in runs)
         about = "RPE: mean over all segments of that length" if i == 0 else ""

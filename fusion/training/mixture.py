@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.terrain.classifier import Mixture
 
+MOST_PARTS = 3
 ITERATIONS = 60
 TOLERANCE = 1e-5
 WINDOWS_PER_SAMPLE = 4
 """Overlapping, correlated windows that count as one independent sample."""
 
 
-def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixture:
-    """The mixture of 1 to `most` Gaussians with the least BIC (Schwarz 1978) for features (n, d).
+def fit_best(x: Array, sigma_floor: Array, order_by: int) -> Mixture:
+    """The mixture of 1 to `MOST_PARTS` Gaussians with the least BIC (Schwarz 1978) for features (n, d).
 
     Args:
         x: (n, d), NaN where not observed.
@@ -27,7 +28,7 @@ def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixt
     best: tuple[float, Mixture] | None = None
     d = x.shape[1]
     samples = len(x) / WINDOWS_PER_SAMPLE
-    for parts in range(1, most + 1):
+    for parts in range(1, MOST_PARTS + 1):
         if samples < (4 * d if parts == 1 else 10 * parts * d):
             break
         mixture, log_likelihood = fit(x, parts, sigma_floor, order_by)

@@ -162,13 +162,13 @@ class Plot:
 
     def line(
         self, x: Array, y: Array, label: str, colour: str, *, dash: str = "solid", width: float = 1.6,
-        most: int = style.MAX_POINTS, name: str | None = None, keep: Iterable[int] = (), alpha: float = 1.0,
+        most: int = style.MAX_POINTS, keep: Iterable[int] = (), alpha: float = 1.0,
     ) -> None:  # fmt: skip
-        """A line, thinned to `most` points; `name` is that of its data, for the script."""
+        """A line, thinned to `most` points."""
         rows = style.thin(len(x), most, keep=keep)
         form = "line" if dash == "solid" else "dash"
         look: dict[str, Any] = {"line_dash": dash, "line_width": width, "alpha": alpha}
-        self.glyph("line", {"x": x[rows], "y": y[rows]}, label, colour, form, name=name, **look)
+        self.glyph("line", {"x": x[rows], "y": y[rows]}, label, colour, form, **look)
 
     def band(self, x: Array, y: Array, sigma: Array, label: str, colour: str, alpha: float = 0.25) -> None:
         """`y` within two `sigma`."""
