@@ -49,10 +49,6 @@ class DataError(TerrafusionError):
     """A recording, or a part of it, that cannot be read or used."""
 
 
-class ClockError(DataError):
-    """Times that run backwards, where no repair of the clock was requested."""
-
-
 class ConfigError(TerrafusionError):
     """A parameter file with an unknown key, a wrong unit or a value out of range."""
 

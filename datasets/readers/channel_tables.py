@@ -1,6 +1,7 @@
 """Tables with the columns of the log folder -> channels of a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,13 +87,15 @@ COLUMNS = {
 class ChannelReader:
     """Makes channels of tables; `notes` collects what was assumed or left out.
 
-    `tables` gives the table of a channel with columns of `COLUMNS`, None where there is none; `rig` the
-    sigmas of fixes that have none.
+    `tables` are those of the channels that are there, with columns of `COLUMNS`; `rig` gives the sigmas of
+    fixes that have none.
     """
+
+    REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = {name: c.required for name, c in COLUMNS.items()}
 
     def __init__(
         self,
-        tables: Callable[[str], CsvTable | None],
+        tables: Mapping[str, CsvTable],
         meta: Meta,
         layouts: Layouts = WHEEL_LAYOUTS,
         rig: Rig | None = None,
@@ -103,14 +106,15 @@ class ChannelReader:
         self.rig = rig
         self.notes: list[str] = list(meta.remarks)
 
-    def command(self) -> Command | None:
-        table = self._table("command")
-        return None if table is None else Command(self._t(table), *(table.numbers[name] for name in COMMAND))
+    def channel(self, name: str) -> Any:
+        """The channel, or the truth; None where there is no table, or none of its rows holds a value."""
+        table = self._table(name)
+        return None if table is None else getattr(self, f"_{name}")(table)
 
-    def wheels(self) -> Wheels | None:
-        table = self._table("wheels")
-        if table is None:
-            return None
+    def _command(self, table: CsvTable) -> Command:
+        return Command(self._t(table), *(table.numbers[name] for name in COMMAND))
+
+    def _wheels(self, table: CsvTable) -> Wheels:
         alone = [names for names, _ in self.layouts if {f"{n}_rad" for n in names} == {*table.numbers}]
         if alone:
             return self._wheels_of_angles(table, alone[0])
@@ -158,18 +162,12 @@ class ChannelReader:
         what = f"columns {', '.join(speeds) or '(none)'} are not a layout"
         raise DataError(what, remedy=f"give one of: {layouts}")
 
-    def imu(self) -> Imu | None:
-        table = self._table("imu")
-        if table is None:
-            return None
+    def _imu(self, table: CsvTable) -> Imu:
         if not table.numbers:
             raise DataError("no column beside t_s", remedy=f"give any of {', '.join([*GYRO, *ACCEL])}")
         return Imu(self._t(table), table.stack(GYRO), table.stack(ACCEL))
 
-    def gnss(self) -> Gnss | None:
-        table = self._table("gnss")
-        if table is None:
-            return None
+    def _gnss(self, table: CsvTable) -> Gnss | None:
         has = table.numbers.__contains__
         missing = [name for name in GNSS_SIGMA[:2] if not has(name)]
         if missing and any(map(has, GNSS_SIGMA)):
@@ -217,19 +215,13 @@ class ChannelReader:
             self.notes.append(f"gnss: {unknown} rows have no fix class; taken as 'single'")
         return np.array([codes[word] for word in words], dtype=np.uint8)[inverse]
 
-    def motor(self) -> Motor | None:
-        table = self._table("motor")
-        if table is None:
-            return None
+    def _motor(self, table: CsvTable) -> Motor:
         voltages = [name for name in VOLTAGES if name in table.numbers]
         if len(voltages) == 1:
             raise DataError(f"'{voltages[0]}' comes alone", remedy="give both voltages or none")
         return Motor(self._t(table), table.stack(CURRENTS), table.stack(VOLTAGES) if voltages else None)
 
-    def terrain(self) -> Terrain | None:
-        table = self._table("terrain")
-        if table is None:
-            return None
+    def _terrain(self, table: CsvTable) -> Terrain:
         return Terrain(
             self._t(table),
             table.texts["label"],
@@ -238,29 +230,21 @@ class ChannelReader:
             table.stack(list(table.numbers)) if table.numbers else None,
         )
 
-    def steering(self) -> Steering | None:
+    def _steering(self, table: CsvTable) -> Steering:
         layouts = [tuple(f"{name}_rad" for name in names) for names in Steering.LAYOUTS]
-        table = self._table("steering")
-        if table is None:
-            return None
         for names, layout in zip(Steering.LAYOUTS, layouts, strict=True):
             if sorted(table.numbers) == sorted(layout):
                 return Steering(self._t(table), table.stack(layout), names)
         what = f"columns {', '.join(table.numbers) or '(none)'} are not a layout"
         raise DataError(what, remedy=f"give one of: {' | '.join(map(', '.join, layouts))}")
 
-    def barometer(self) -> Barometer | None:
-        table = self._table("barometer")
-        return None if table is None else Barometer(self._t(table), table.numbers["pressure_pa"])
+    def _barometer(self, table: CsvTable) -> Barometer:
+        return Barometer(self._t(table), table.numbers["pressure_pa"])
 
-    def magnetometer(self) -> Magnetometer | None:
-        table = self._table("magnetometer")
-        return None if table is None else Magnetometer(self._t(table), table.stack(FIELD))
+    def _magnetometer(self, table: CsvTable) -> Magnetometer:
+        return Magnetometer(self._t(table), table.stack(FIELD))
 
-    def truth(self) -> Trajectory | None:
-        table = self._table("truth")
-        if table is None:
-            return None
+    def _truth(self, table: CsvTable) -> Trajectory:
         quaternion = self._quaternion(table)
         twist = None
         if any(name in table.numbers for name in TRUTH_TWIST):
@@ -304,16 +288,13 @@ class ChannelReader:
     def _t(self, table: CsvTable) -> NDArray[np.int64]:
         return table.t_ns + np.int64(self.meta.start_ns)
 
-    def _table(self, channel: str, required: Sequence[str] | None = None) -> CsvTable | None:
-        """The channel's rows that hold a value, or None when the file is absent or has none.
-
-        `required` columns are those of `COLUMNS` unless given.
-        """
-        table = self.tables(channel)
+    def _table(self, channel: str) -> CsvTable | None:
+        """The channel's rows that hold a value, or None when the table is absent or has none."""
+        table = self.tables.get(channel)
         if table is None:
             return None
         self.notes.extend(table.notes)
-        required = COLUMNS[channel].required if required is None else required
+        required = self.REQUIRED[channel]
         missing = [name for name in required if name not in table.numbers and name not in table.texts]
         if missing:
             what = f"column '{missing[0]}' is missing"

@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import TimesNs
-from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import Columns, TextLayout, not_a_table, read_columns, read_text
 
@@ -66,9 +66,8 @@ def read_table(path: Path, known: ChannelColumns, *, in_order: bool = True) -> C
         in_order: refuse times that run backwards.
 
     Raises:
-        ClockError: a time runs backwards.
         DataError: unreadable or empty file, unknown or repeated column, a cell that is not a
-            finite number, a line with too few or too many cells, a time that is missing
+            finite number, a line with too few or too many cells, a time that is missing, runs backwards
             or looks like Unix time. The message names file, column, line and time.
     """
     with errors_of(path):
@@ -109,11 +108,6 @@ def _header(data: bytes, known: ChannelColumns) -> list[str]:
     return header
 
 
-def read_times(path: Path) -> TimesNs:
-    """The times of a table as they stand there, in any order; errors as in `read_table`."""
-    return read_table(path, ChannelColumns((), ("fix", "label"), ("",)), in_order=False).t_ns
-
-
 def _check_times(t_ns: TimesNs, *, in_order: bool) -> None:
     far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
     if far.size:
@@ -124,7 +118,7 @@ def _check_times(t_ns: TimesNs, *, in_order: bool) -> None:
     back = np.flatnonzero(np.diff(t_ns) < 0)
     if back.size and in_order:
         i = int(back[0])
-        raise ClockError(
+        raise DataError(
             f"time runs backwards from {t_ns[i] * 1e-9:.9f} to {t_ns[i + 1] * 1e-9:.9f} s at row {i + 2}",
             channel="t_s",
             time_s=float(t_ns[i]) * 1e-9,

@@ -12,15 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import repair_together, sorting
-from terrafusion.datasets.core.errors import ClockError, DataError, errors_of
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
-from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
-from terrafusion.datasets.readers.csv_table import CsvTable, read_table, read_times
+from terrafusion.datasets.readers.csv_table import CsvTable, read_table
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 
@@ -34,66 +32,59 @@ def claims(path: Path, head: bytes) -> bool:
 
 
 def read(request: Request) -> list[Recording]:
-    """The one recording of a log folder."""
-    try:
-        return [read_log_folder(request.path, rig=request.rig)]
-    except ClockError:
-        if not request.repair_clock:
-            raise
-    return [_with_clock_repaired(request.path, request.rig)]
-
-
-def _with_clock_repaired(folder: Path, rig: Rig | None) -> Recording:
-    """Read a log folder whose times run backwards somewhere."""
-    files = _Folder(folder)
-    paths = {channel: files.path(channel) for channel in CHANNELS}
-    times = {channel: read_times(path) for channel, path in paths.items() if path is not None}
-    clocks, jumps = repair_together(times)
-    recording = read_log_folder(folder, clocks, rig)
-    moved = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + recording.start_ns) for jump in jumps)
-    return dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))
-
-
-def read_log_folder(
-    folder: Path, clocks: Mapping[str, TimesNs] | None = None, rig: Rig | None = None
-) -> Recording:
-    """Read a log folder.
-
-    Args:
-        clocks: times in ns from the start, by channel, in place of those of the files; one for each row.
-        rig: of the robot, whose receiver gives the sigmas of fixes without one.
-
-    Returns:
-        Recording named after the folder, times in ns from `start_ns`; its notes say what was
-        left out or assumed.
+    """The one recording of a log folder: named after it, times in ns from `start_ns`.
 
     Raises:
         ConfigError: meta.yaml is wrong. DataError: meta.yaml is missing or a CSV is wrong; the
             message names file, column, line or time, and the remedy.
     """
-    meta_path = folder / META
-    if not meta_path.is_file():
+    folder = request.path
+    meta = _meta(folder)
+    paths = {name: path for name in CHANNELS if (path := _csv_of(folder, name)) is not None}
+    in_order = not request.repair_clock
+    tables = {name: read_table(path, COLUMNS[name], in_order=in_order) for name, path in paths.items()}
+    jumps: tuple[ClockJump, ...] = ()
+    notes: list[str] = []
+    if request.repair_clock:
+        clocks, jumps = repair_together({name: table.t_ns for name, table in tables.items()})
+        jumps = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + meta.start_ns) for jump in jumps)
+        tables = {
+            name: _sorted(dataclasses.replace(tables[name], t_ns=t), notes) for name, t in clocks.items()
+        }
+    reader, channels = ChannelReader(tables, meta, rig=request.rig), {}
+    for name in CHANNELS:
+        with errors_of(paths.get(name, folder)):
+            channels[name] = reader.channel(name)
+    if not any(channel is not None and len(channel) for channel in channels.values()):
+        names = ", ".join(f"{name}.csv" for name in CHANNELS)
+        raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
+    notes = [*reader.notes, *notes, *_unknown_files(folder)]
+    recording = recording_of(channels, meta, folder.resolve().name, notes)
+    return [dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *jumps))]
+
+
+def _meta(folder: Path) -> Meta:
+    """`meta.yaml`, with the path of a vehicle file that lies in the folder."""
+    if not (folder / META).is_file():
         is_log = any((folder / f"{name}.csv{gz}").is_file() for name in CHANNELS for gz in ("", ".gz"))
         logs = [] if is_log else logs_in(folder)
         remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
         if logs:
             remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
-    meta = read_meta(meta_path)
+    meta = read_meta(folder / META)
     vehicle = folder / expanded(meta.vehicle or "")
     if vehicle.suffix in (".yaml", ".yml") and vehicle.is_file():
-        meta = dataclasses.replace(meta, vehicle=str(vehicle.resolve()))
-    source = _Folder(folder, clocks)
-    reader, channels = ChannelReader(source.table, meta, rig=rig), {}
-    for name in CHANNELS:
-        with errors_of(source.path(name) or folder):
-            channels[name] = getattr(reader, name)()
-    if not any(channel is not None and len(channel) for channel in channels.values()):
-        names = ", ".join(f"{name}.csv" for name in CHANNELS)
-        raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
-    return recording_of(
-        channels, meta, folder.resolve().name, [*reader.notes, *source.notes, *source.unknown_files()]
-    )
+        return dataclasses.replace(meta, vehicle=str(vehicle.resolve()))
+    return meta
+
+
+def _sorted(table: CsvTable, notes: list[str]) -> CsvTable:
+    late = sorting(table.t_ns, table.file.partition(".")[0])
+    if late is None:
+        return table
+    notes.append(late[1])
+    return table.select(late[0])
 
 
 def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequence[str]) -> Recording:
@@ -122,55 +113,32 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
     )
 
 
-class _Folder:
-    """The tables of one folder, each read from its CSV; `notes` say which rows were sorted."""
+def _csv_of(folder: Path, channel: str) -> Path | None:
+    """The file of a channel, None where there is none."""
+    plain, packed = folder / f"{channel}.csv", folder / f"{channel}.csv.gz"
+    if plain.exists() and packed.exists():
+        raise DataError(f"both {plain.name} and {packed.name} exist", file=folder, remedy="keep one of them")
+    for path in (plain, packed):
+        if path.is_symlink() and not path.exists():
+            raise DataError("is a link to nothing", file=path, remedy="mend the link, or remove it")
+        if path.exists() and not path.is_file():
+            raise DataError("is no file", file=path, remedy="give a CSV file, or remove it")
+    return plain if plain.exists() else packed if packed.exists() else None
 
-    def __init__(self, folder: Path, clocks: Mapping[str, TimesNs] | None = None) -> None:
-        self.folder = folder
-        self.clocks = clocks or {}
-        self.notes: list[str] = []
 
-    def table(self, channel: str) -> CsvTable | None:
-        path = self.path(channel)
-        if path is None:
-            return None
-        if channel not in self.clocks:
-            return read_table(path, COLUMNS[channel])
-        table = read_table(path, COLUMNS[channel], in_order=False)
-        table = dataclasses.replace(table, t_ns=self.clocks[channel])
-        late = sorting(table.t_ns, channel)
-        if late is None:
-            return table
-        self.notes.append(late[1])
-        return table.select(late[0])
-
-    def path(self, channel: str) -> Path | None:
-        """The file of a channel, None where there is none."""
-        plain, packed = self.folder / f"{channel}.csv", self.folder / f"{channel}.csv.gz"
-        if plain.exists() and packed.exists():
-            raise DataError(
-                f"both {plain.name} and {packed.name} exist", file=self.folder, remedy="keep one of them"
-            )
-        for path in (plain, packed):
-            if path.is_symlink() and not path.exists():
-                raise DataError("is a link to nothing", file=path, remedy="mend the link, or remove it")
-            if path.exists() and not path.is_file():
-                raise DataError("is no file", file=path, remedy="give a CSV file, or remove it")
-        return plain if plain.exists() else packed if packed.exists() else None
-
-    def unknown_files(self) -> Iterator[str]:
-        """A note for each CSV that is no channel, and each channel that is no CSV: they are not read."""
-        for path in sorted(self.folder.iterdir()):
-            stem = path.name.removesuffix(".gz").removesuffix(".csv")
-            if stem == path.name or not path.name.endswith((".csv", ".csv.gz")):
-                if path.stem in CHANNELS and path.is_file():
-                    yield f"{path.name} was not read: a log folder has {path.stem}.csv or {path.stem}.csv.gz"
-                continue
-            if stem in CHANNELS:
-                continue
-            close = difflib.get_close_matches(stem, CHANNELS, n=1)
-            meant = f" (did you mean {close[0]}.csv?)" if close else ""
-            yield f"{path.name} is not a channel of the format and was not read{meant}"
+def _unknown_files(folder: Path) -> Iterator[str]:
+    """A note for each CSV that is no channel, and each channel that is no CSV: they are not read."""
+    for path in sorted(folder.iterdir()):
+        stem = path.name.removesuffix(".gz").removesuffix(".csv")
+        if stem == path.name or not path.name.endswith((".csv", ".csv.gz")):
+            if path.stem in CHANNELS and path.is_file():
+                yield f"{path.name} was not read: a log folder has {path.stem}.csv or {path.stem}.csv.gz"
+            continue
+        if stem in CHANNELS:
+            continue
+        close = difflib.get_close_matches(stem, CHANNELS, n=1)
+        meant = f" (did you mean {close[0]}.csv?)" if close else ""
+        yield f"{path.name} is not a channel of the format and was not read{meant}"
 
 
 def truth_contents(truth: Trajectory) -> tuple[str, ...]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions
@@ -93,15 +92,17 @@ def restore(
     }
     found = read(asked)
     streams = {name: found[key] for name, key in keys.items() if key in there}
-    tables = ChannelReader(_BagTables(saved, file, streams).table, saved.meta, LAYOUTS)
+    names = [name for name in CHANNELS if name in saved.tables]
+    tables = {name: _table(saved, name, streams.get(name), file.name) for name in names}
+    reader = ChannelReader(tables, saved.meta, LAYOUTS)
     builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {}, as_written=True)
     channels = {
-        name: getattr(tables, name)()
-        if name in saved.tables
+        name: reader.channel(name)
+        if name in tables
         else _standard(builder, name, streams.get(name), saved.shift_ns)
         for name in CHANNELS
     }
-    return recording_of(channels, saved.meta, file.stem, tables.notes)
+    return recording_of(channels, saved.meta, file.stem, reader.notes)
 
 
 def _parse(stream: Stream, file: Path) -> SavedChannels:
@@ -135,43 +136,32 @@ def _standard(builder: ChannelBuilder, name: str, stream: Stream | None, shift_n
     return getattr(builder, name)(stream, t_ns)
 
 
-class _BagTables:
-    """The tables of a bag."""
-
-    def __init__(self, saved: SavedChannels, file: Path, streams: Mapping[str, Stream]) -> None:
-        self.saved = saved
-        self.file = file
-        self.streams = streams
-
-    def table(self, channel: str) -> CsvTable | None:
-        columns, known = self.saved.tables[channel], COLUMNS[channel]
-        names = {*known.numbers, *known.texts} | ({*wheel_columns(LAYOUTS)} if channel == "wheels" else set())
-        strange = [c for c in columns if c not in names and not c.startswith(known.prefixes)]
-        if strange or len(set(columns)) != len(columns):
-            raise self._error(channel, f"the columns {', '.join(columns)}")
-        stream = self.streams.get(channel)
-        shape = (len(stream) if stream is not None else 0, len(STAMP) + len(columns))
-        rows = stream.column("data") if stream is not None and len(stream) else np.zeros(shape)
-        if rows.shape != shape:
-            raise self._error(channel, f"{rows.shape[1:]} numbers a row for {shape[1:]}")
-        stamps = rows[:, : len(STAMP)]
-        if not ((np.abs(stamps) < 2**32) & (stamps == np.rint(stamps))).all():
-            raise self._error(channel, "stamps that are no times")
-        seconds, nanoseconds = stamps.astype(np.int64).T
-        t_ns = seconds * 10**9 + nanoseconds - self.saved.shift_ns - self.saved.meta.start_ns
-        if (np.diff(t_ns) < 0).any():
-            raise self._error(channel, "stamps that run backwards")
-        numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
-        words = {
-            name: self._words(channel, name, numbers.pop(name)) for name in known.texts if name in numbers
-        }
-        return CsvTable(t_ns=t_ns, file=self.file.name, numbers=numbers, texts=words)
-
-    def _words(self, channel: str, column: str, codes: NDArray[np.float64]) -> NDArray[Any]:
-        words = self.saved.words.get(column, [])
+def _table(saved: SavedChannels, channel: str, stream: Stream | None, file: str) -> CsvTable:
+    columns, known = saved.tables[channel], COLUMNS[channel]
+    names = {*known.numbers, *known.texts} | ({*wheel_columns(LAYOUTS)} if channel == "wheels" else set())
+    strange = [c for c in columns if c not in names and not c.startswith(known.prefixes)]
+    if strange or len(set(columns)) != len(columns):
+        raise _error(channel, f"the columns {', '.join(columns)}")
+    shape = (len(stream) if stream is not None else 0, len(STAMP) + len(columns))
+    rows = stream.column("data") if stream is not None and len(stream) else np.zeros(shape)
+    if rows.shape != shape:
+        raise _error(channel, f"{rows.shape[1:]} numbers a row for {shape[1:]}")
+    stamps = rows[:, : len(STAMP)]
+    if not ((np.abs(stamps) < 2**32) & (stamps == np.rint(stamps))).all():
+        raise _error(channel, "stamps that are no times")
+    seconds, nanoseconds = stamps.astype(np.int64).T
+    t_ns = seconds * 10**9 + nanoseconds - saved.shift_ns - saved.meta.start_ns
+    if (np.diff(t_ns) < 0).any():
+        raise _error(channel, "stamps that run backwards")
+    numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
+    texts = {}
+    for name in (name for name in known.texts if name in numbers):
+        codes, words = numbers.pop(name), saved.words.get(name, [])
         if not ((codes >= 0) & (codes < len(words)) & (codes == np.rint(codes))).all():
-            raise self._error(channel, f"a {column} that stands for no word")
-        return np.array([*words, None], dtype=object)[codes.astype(np.int64)]
+            raise _error(channel, f"a {name} that stands for no word")
+        texts[name] = np.array([*words, None], dtype=object)[codes.astype(np.int64)]
+    return CsvTable(t_ns=t_ns, file=file, numbers=numbers, texts=texts)
 
-    def _error(self, channel: str, what: str) -> DataError:
-        return DataError(f"the table has {what}", channel=f"{PREFIX}{channel}", remedy=REMEDY)
+
+def _error(channel: str, what: str) -> DataError:
+    return DataError(f"the table has {what}", channel=f"{PREFIX}{channel}", remedy=REMEDY)

@@ -2,13 +2,14 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, distinct
+from terrafusion.datasets.core.arrays import TimesNs, distinct
 from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
@@ -17,11 +18,12 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
+from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
+from terrafusion.datasets.readers.log_meta import Meta
 from terrafusion.datasets.readers.text.column_map import (
     GEODETIC,
     TEXT_FIELDS,
@@ -33,7 +35,7 @@ from terrafusion.datasets.readers.text.column_map import (
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
-from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
+from terrafusion.datasets.readers.text.row_times import row_times
 from terrafusion.datasets.readers.text.text_columns import TextColumns
 from terrafusion.datasets.readers.text.units import units_of
 
@@ -112,8 +114,11 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
         raise DataError("holds no rows", remedy="record or copy it again")
     start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
-    reader = _Reader(_Source(request.path, columns, column_map, times, start_ns), meta, request)
-    channels = {name: getattr(reader, name)() for name in CHANNELS}
+    fields = {name: fields for name, fields in column_map.channels.items() if fields}
+    t_s = times.t_ns - start_ns
+    tables = {name: _table(columns, of, times.order, t_s, request.path.name) for name, of in fields.items()}
+    reader = _Reader(tables, meta, request)
+    channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
     of_text = columns.notes if isinstance(columns, TextColumns) else ()
@@ -159,48 +164,39 @@ def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[s
     return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
 
 
-class _Source:
-    """The mapped columns of a file as tables of channels, in SI units."""
+def _table(
+    columns: TableColumns, fields: Mapping[str, MappedColumn], order: Any, t_ns: TimesNs, file: str
+) -> CsvTable:
+    """The mapped columns of a channel in SI units, its rows in the `order` of their times."""
+    texts = {name: _words(columns, name, of)[order] for name, of in fields.items() if name in TEXT_FIELDS}
+    numbers = {}
+    for name, of in fields.items():
+        if name not in TEXT_FIELDS:
+            factor = units_of(name).get(of.unit, 1.0) * (-of.scale if of.sign == "-" else of.scale)
+            values = columns.numbers(of.column)[order]
+            numbers[name] = values if factor == 1.0 else values * factor
+    if "yaw_rad" in numbers:
+        yaw = numbers.pop("yaw_rad")
+        rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)
+        numbers |= dict(zip(QUATERNION, rpy_to_quaternion(rpy).T, strict=True))
+    return CsvTable(t_ns=t_ns, file=file, numbers=numbers, texts=texts)
 
-    def __init__(
-        self, path: Path, columns: TableColumns, column_map: ColumnMap, times: RowTimes, start_ns: int
-    ) -> None:
-        self.path, self.columns, self.found, self.times = path, columns, column_map, times
-        self.t_ns = times.t_ns - start_ns
 
-    def table(self, channel: str) -> CsvTable | None:
-        fields = self.found.channels.get(channel, {})
-        if not fields:
-            return None
-        numbers = {name: self._numbers(name, of) for name, of in fields.items() if name not in TEXT_FIELDS}
-        words = {name: self._texts(name, of) for name, of in fields.items() if name in TEXT_FIELDS}
-        if "yaw_rad" in numbers:
-            yaw = numbers.pop("yaw_rad")
-            zero = np.zeros(len(yaw))
-            numbers |= dict(
-                zip(QUATERNION, rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)).T, strict=True)
+def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
+    """Texts (N,) of a column; codes of fixes in words."""
+    texts = columns.texts(of.column)
+    if name != "fix" or not of.unit:
+        return texts
+    words, inverse = distinct(texts)
+    codes = FIX_WORDS[of.unit]
+    meanings = [codes.get(_whole(word), "") for word in words]
+    for word, meant in zip(words, meanings, strict=True):
+        if word.strip() and not meant:
+            raise DataError(
+                f"column '{of.column}' is '{word[:40]}'",
+                remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
             )
-        return CsvTable(t_ns=self.t_ns, file=self.path.name, numbers=numbers, texts=words)
-
-    def _numbers(self, name: str, of: MappedColumn) -> Array:
-        values = self.columns.numbers(of.column)[self.times.order]
-        factor = units_of(name).get(of.unit, 1.0) * (-of.scale if of.sign == "-" else of.scale)
-        return values if factor == 1.0 else values * factor
-
-    def _texts(self, name: str, of: MappedColumn) -> NDArray[Any]:
-        texts = self.columns.texts(of.column)[self.times.order]
-        if name != "fix" or not of.unit:
-            return texts
-        words, inverse = distinct(texts)
-        codes = FIX_WORDS[of.unit]
-        meanings = [codes.get(_whole(word), "") for word in words]
-        for word, meant in zip(words, meanings, strict=True):
-            if word.strip() and not meant:
-                raise DataError(
-                    f"column '{of.column}' is '{word[:40]}'",
-                    remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
-                )
-        return np.array(meanings, dtype=object)[inverse]
+    return np.array(meanings, dtype=object)[inverse]
 
 
 def _whole(word: str) -> int:
@@ -215,34 +211,32 @@ def _whole(word: str) -> int:
 class _Reader(ChannelReader):
     """Channels of a table; a GNSS channel may be in latitude and longitude, and without sigmas."""
 
-    def __init__(self, source: _Source, meta: Any, request: Request) -> None:
-        super().__init__(source.table, meta)
+    REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}
+
+    def __init__(self, tables: Mapping[str, CsvTable], meta: Meta, request: Request) -> None:
+        super().__init__(tables, meta)
         self.request = request
         self.datum: Datum | None = meta.datum
 
-    def gnss(self) -> Gnss | None:
-        table = self._table("gnss", required=())
-        if table is None:
-            return None
+    def _gnss(self, table: CsvTable) -> Gnss | None:
         for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
             if (a in table.numbers) != (b in table.numbers):
                 raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
-        fix = self._fix(table)
-        sigma = table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m"))
+        local = "latitude_deg" not in table.numbers
+        place = table.stack(("east_m", "north_m", "up_m") if local else GEODETIC)
+        fix, sigma = self._fix(table), table.stack(GNSS_SIGMA)
         velocity = table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None
         sigma_v = table.numbers.get("sigma_v_mps")
-        if "latitude_deg" in table.numbers:
-            fixes = Fixes(self._t(table), table.stack(GEODETIC), fix, sigma, velocity, sigma_v)
+        if not local:
+            fixes = Fixes(self._t(table), place, fix, sigma, velocity, sigma_v)
             channel, self.datum, notes = gnss_channel(self.request, fixes, self.datum)
             self.notes += notes
             return channel
         sigma, notes = with_assumed_sigma(self.request.rig, sigma, fix)
         self.notes += notes
-        channel = Gnss(
-            self._t(table), table.stack(("east_m", "north_m", "up_m")), sigma, fix, velocity, sigma_v
-        )
+        gnss = Gnss(self._t(table), place, sigma, fix, velocity, sigma_v)
         held = fix > Fix.NONE
         if held.all():
-            return channel
+            return gnss
         self.notes.append(f"gnss: {int((~held).sum())} rows hold no fix; left out")
-        return channel.select(held) if held.any() else None
+        return gnss.select(held) if held.any() else None
