@@ -5,7 +5,7 @@ Refused are what would hang a reader or hide a mistake: double keys, merge keys 
 nesting, and aliases that stand for very many values.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +46,13 @@ def read_yaml(path: Path, most_bytes: int = limits.YAML_BYTES) -> dict[str, Any]
 
 
 def _loaded(text: str, path: Path) -> Any:
+    from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
+    yaml: Any = YAML(typ="safe", pure=True)
     try:
-        return _Builder(text).document()
+        node = yaml.compose(text)
+        return None if node is None else _Values(yaml.constructor).of(node)
     except (YAMLError, ValueError, RecursionError) as error:
         problem = str(getattr(error, "problem", None) or error).split("\n")[0]
         mark = getattr(error, "problem_mark", None)
@@ -71,90 +74,65 @@ def dump_yaml(path: Path, content: Mapping[str, Any], **settings: Any) -> Path:
     return write_atomically(path, lambda part: yaml.dump(content, part))
 
 
-class _Builder:
-    """Values from the events of ruamel's parser."""
+class _Values:
+    """Plain values of the nodes that ruamel composes."""
 
-    def __init__(self, text: str) -> None:
-        from ruamel.yaml import YAML
-        from ruamel.yaml.nodes import ScalarNode
+    def __init__(self, constructor: Any) -> None:
+        self._constructor = constructor
+        self._known: dict[int, tuple[Any, int]] = {}
+        """Value and number of values of each collection, by its node: an alias is the same node again."""
+        self._count = 0
 
-        self._yaml, self._scalar_node = YAML(typ="safe", pure=True), ScalarNode
-        self._events: Iterator[Any] = self._yaml.parse(text)
-        self._anchors: dict[str, tuple[Any, int]] = {}
-        self._values = 0
-
-    def document(self) -> Any:
-        next(self._events)
-        if type(next(self._events)).__name__ == "StreamEndEvent":
-            return None
-        value = self._value(next(self._events), 0)
-        next(self._events)
-        end = next(self._events)
-        if type(end).__name__ != "StreamEndEvent":
-            raise _problem(end, "a second document")
-        return value
-
-    def _value(self, event: Any, depth: int) -> Any:
-        kind = type(event).__name__
-        before = self._values
-        self._values += 1
-        if kind == "AliasEvent":
-            if event.anchor not in self._anchors:
-                raise _problem(event, f"'*{event.anchor}' stands for nothing before it")
-            value, size = self._anchors[event.anchor]
-            self._values += size
-        elif kind == "ScalarEvent":
-            value = self._scalar(event)
+    def of(self, node: Any, depth: int = 0) -> Any:
+        """The value of a node; what an alias stands for counts each time."""
+        self._count += 1
+        if id(node) in self._known:
+            value, size = self._known[id(node)]
+            self._count += size
+        elif isinstance(node.value, str):
+            value = self._scalar(node)
         else:
-            value = self._collection(event, kind, depth)
-        if self._values > limits.YAML_VALUES:
+            before = self._count
+            value = self._collection(node, depth)
+            self._known[id(node)] = value, self._count - before
+        if self._count > limits.YAML_VALUES:
             raise _problem(
-                event, f"more than {limits.YAML_VALUES} values; aliases count as what they stand for"
+                node, f"more than {limits.YAML_VALUES} values; aliases count as what they stand for"
             )
-        if event.anchor is not None:
-            self._anchors[event.anchor] = value, self._values - before
         return value
 
-    def _collection(self, event: Any, kind: str, depth: int) -> Any:
+    def _collection(self, node: Any, depth: int) -> Any:
         if depth >= limits.YAML_DEPTH:
-            raise _problem(event, f"nested more than {limits.YAML_DEPTH} deep")
-        if event.tag is not None and str(event.tag) not in (f"{_TAG}map", f"{_TAG}seq", "!"):
-            raise _problem(event, f"the tag {event.tag} is not known here")
-        if kind == "SequenceStartEvent":
-            return [self._value(item, depth + 1) for item in self._until("SequenceEndEvent")]
+            raise _problem(node, f"nested more than {limits.YAML_DEPTH} deep, or inside itself")
+        kind = str(node.tag).removeprefix(_TAG)
+        if kind == "seq":
+            return [self.of(item, depth + 1) for item in node.value]
+        if kind != "map":
+            raise _problem(node, f"the tag {node.tag} is not known here")
         mapping: dict[Any, Any] = {}
-        for at in self._until("MappingEndEvent"):
-            if getattr(at, "value", None) == "<<" and at.implicit[0]:
+        for at, item in node.value:
+            if str(at.tag) == f"{_TAG}merge":
                 raise _problem(at, "merge keys '<<' are not allowed; write the keys out")
-            key = self._value(at, depth + 1)
+            key = self.of(at, depth + 1)
             if isinstance(key, (dict, list)):
                 raise _problem(at, "a key must be a plain value")
             if key in mapping:
                 raise _problem(at, f"the key '{key}' is there twice")
-            mapping[key] = self._value(next(self._events), depth + 1)
+            mapping[key] = self.of(item, depth + 1)
         return mapping
 
-    def _until(self, end: str) -> Iterator[Any]:
-        while type(event := next(self._events)).__name__ != end:
-            yield event
-
-    def _scalar(self, event: Any) -> Any:
-        tag = str(event.tag) if event.tag is not None else None
-        if tag is None or tag == "!":
-            implicit = event.implicit if tag is None else (False, True)
-            tag = str(self._yaml.resolver.resolve(self._scalar_node, event.value, implicit))
-        kind = tag.removeprefix(_TAG)
+    def _scalar(self, node: Any) -> Any:
+        kind = str(node.tag).removeprefix(_TAG)
         if kind in ("str", "timestamp", "merge", "value"):
-            return event.value
+            return node.value
         if kind not in ("int", "float", "bool", "null"):
-            raise _problem(event, f"the tag {tag} is not known here")
-        if len(event.value) > limits.YAML_NUMBER:
-            raise _problem(event, f"a number of {len(event.value)} characters")
-        node = self._scalar_node(tag, event.value, event.start_mark, event.end_mark)
-        return getattr(self._yaml.constructor, f"construct_yaml_{kind}")(node)
+            raise _problem(node, f"the tag {node.tag} is not known here")
+        if len(node.value) > limits.YAML_NUMBER:
+            raise _problem(node, f"a number of {len(node.value)} characters")
+        return getattr(self._constructor, f"construct_yaml_{kind}")(node)
 
 
-def _problem(event: Any, text: str) -> Exception:
+def _problem(node: Any, text: str) -> Exception:
     from ruamel.yaml.error import MarkedYAMLError
 
-    return MarkedYAMLError(problem=text, problem_mark=event.start_mark)
+    return MarkedYAMLError(problem=text, problem_mark=node.start_mark)
