@@ -5,7 +5,7 @@ Each check is one function from a `CheckContext` to findings; `run.CHECKS` lists
 """
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding
-from terrafusion.datasets.checks.plausibility import check_magnitude
+from terrafusion.datasets.checks.outliers import check_magnitude
 from terrafusion.datasets.checks.run import CHECKS, repair, run_checks
 
 __all__ = ["CHECKS", "CheckContext", "Finding", "check_magnitude", "repair", "run_checks"]

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, counted, period_s, retiming
-from terrafusion.datasets.checks.motion import Signal
-from terrafusion.datasets.checks.sensor_pairs import LEAST_R, Pair, SensorPairs, near_lag, reason
+from terrafusion.datasets.checks.motion import LEAST_R, Pair, SensorPairs, Signal, near_lag, reason
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording

@@ -7,20 +7,20 @@ import numpy as np
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
 from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed, retiming
-from terrafusion.datasets.checks.motion import Signal
-from terrafusion.datasets.checks.path import path_by
-from terrafusion.datasets.checks.path_model import path_model
-from terrafusion.datasets.checks.sensor_pairs import (
+from terrafusion.datasets.checks.motion import (
     LEAST_R,
     SPEED_PAIRS,
     YAW_PAIRS,
     Pair,
     SensorPairs,
+    Signal,
     far_lag,
     odd_one,
     reason,
     signal_pairs,
 )
+from terrafusion.datasets.checks.path import path_by
+from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
 from terrafusion.datasets.core.arrays import Array, Mask

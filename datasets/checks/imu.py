@@ -12,7 +12,6 @@ from itertools import permutations
 import numpy as np
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
 from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
@@ -26,7 +25,7 @@ from terrafusion.datasets.checks.finding import (
 from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
 from terrafusion.datasets.core.arrays import Array, Complex, Mask
-from terrafusion.datasets.core.bootstrap import resampled_rows
+from terrafusion.datasets.core.bootstrap import RESAMPLES, SEED, interval_of, resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.frames import GRAVITY_MPS2

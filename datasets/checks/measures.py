@@ -13,6 +13,8 @@ from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.delays import opposed
 from terrafusion.datasets.checks.finding import CheckContext, with_fields
 from terrafusion.datasets.checks.imu import nearest_axis
+from terrafusion.datasets.checks.motion import far_lag, near_lag
+from terrafusion.datasets.checks.outliers import check_magnitude
 from terrafusion.datasets.checks.path import (
     MeasuredPath,
     PathFits,
@@ -21,8 +23,6 @@ from terrafusion.datasets.checks.path import (
     path_by,
     scale_of,
 )
-from terrafusion.datasets.checks.plausibility import check_magnitude
-from terrafusion.datasets.checks.sensor_pairs import far_lag, near_lag
 from terrafusion.datasets.checks.signals import MEASURED
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.conventions import true_updates

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.core.arrays import Array, Complex
-from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
+from terrafusion.datasets.core.bootstrap import RESAMPLES, SEED, percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
 
 SHORTEST_M, SIGMAS, LONGEST_S = 6.0, 20.0, 60.0

@@ -12,12 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import cumulative
 from terrafusion.datasets.checks.path import MeasuredPath, driven_and_turned
 from terrafusion.datasets.core.arrays import Array, Complex
-from terrafusion.datasets.core.bootstrap import resampled_rows
+from terrafusion.datasets.core.bootstrap import (
+    RESAMPLES,
+    SEED,
+    BootstrapInterval,
+    interval_of,
+    resampled_rows,
+)
 
 LEAST_WINDOWS, LEAST_CONTRIBUTING, LEAST_ROWS, MOST_HZ = 5, 2.0, 8, 5.0
 """Windows that are needed, those of them that show a number, positions in each, and the rate that more would

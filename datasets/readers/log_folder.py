@@ -17,8 +17,7 @@ from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader
-from terrafusion.datasets.readers.csv_table import CsvTable, read_table
+from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, CsvTable, read_table
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 

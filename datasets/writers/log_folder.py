@@ -1,9 +1,13 @@
-"""Write a recording as a log folder; reading it back gives the same recording to the bit."""
+"""Write a recording as a log folder; reading it back gives the same recording to the bit.
+
+The vehicle file that a recording names is copied beside it: the folder can be moved.
+"""
 
 import dataclasses
 import json
 import os
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,15 +18,15 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.scratch import PREFIX, UNFINISHED, is_part, scratch_folder, sweep
 from terrafusion.datasets.core.wrapped_angles import unwrapped
-from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
-from terrafusion.datasets.readers.csv_table import MAX_T_S
+from terrafusion.datasets.core.yaml_file import dump_yaml, read_yaml
+from terrafusion.datasets.readers.channel_tables import MAX_T_S, WHEEL_LAYOUTS
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
 from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
-from terrafusion.datasets.writers.vehicle_copy import COPY, copy_vehicle, vehicle_file
 
 BLOCK_ROWS = 100_000
 """Rows that are turned into text at a time, which bounds the memory."""
@@ -188,3 +192,34 @@ def _meta_text(meta: dict[str, Any], folder: Path) -> str:
             remedy="shorten the notes",
         )
     return text
+
+
+COPY = "vehicle.yaml"
+MOST_FILES = 10
+"""So many files may extend each other; a circle is refused where the vehicle is loaded."""
+
+
+def vehicle_file(vehicle: str | None) -> Path | None:
+    """The absolute path of the file that a recording names as its vehicle; None for a name or no vehicle."""
+    path = expanded(vehicle or "")
+    return path.resolve() if path.suffix in (".yaml", ".yml") and path.is_file() else None
+
+
+def copy_vehicle(file: Path, folder: Path) -> None:
+    """Copy a vehicle file to `vehicle.yaml`, and each file it extends to `vehicle_2.yaml`, ...
+
+    Raises:
+        ConfigError: it is not YAML. OSError: it cannot be copied.
+    """
+    name = COPY
+    for number in range(2, MOST_FILES + 2):
+        content = read_yaml(file)
+        robot = content.get("robot")
+        under = robot.get("extends") if isinstance(robot, dict) else None
+        below = vehicle_file(str(file.parent / expanded(under))) if isinstance(under, str) else None
+        if below is None or not isinstance(robot, dict):
+            shutil.copyfile(file, folder / name)
+            return
+        following = f"vehicle_{number}.yaml"
+        dump_yaml(folder / name, {**content, "robot": {**robot, "extends": following}})
+        file, name = below, following

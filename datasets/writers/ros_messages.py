@@ -24,7 +24,7 @@ from terrafusion.datasets.core.channels import (
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
-from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE
+from terrafusion.datasets.readers.ros.streams import UNKNOWN_VARIANCE
 from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.datasets.writers.mcap_file import TopicMessages
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from terrafusion.datasets.readers.ros.layout import MessageDecoder
-from terrafusion.datasets.readers.ros.messages import Stream
 from terrafusion.datasets.readers.ros.raw import MessageBatch
+from terrafusion.datasets.readers.ros.streams import Stream
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_600_000_000_000_000_000

@@ -23,10 +23,9 @@ from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder, Datum
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
-from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch
 from terrafusion.datasets.readers.ros.static_frames import turned_by
-from terrafusion.datasets.readers.ros.streams import broken_bag_on_error, types_of
+from terrafusion.datasets.readers.ros.streams import Stream, broken_bag_on_error, types_of, wanted_fields
 from terrafusion.datasets.readers.ros.topics import joints_given
 
 LIVE = Path("live")

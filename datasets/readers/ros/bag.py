@@ -17,7 +17,6 @@ from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.exact import META, restore
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
-from terrafusion.datasets.readers.ros.messages import Stream, twists, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.static_frames import (
     STATIC,
@@ -27,7 +26,14 @@ from terrafusion.datasets.readers.ros.static_frames import (
     mounting_note,
     with_mountings,
 )
-from terrafusion.datasets.readers.ros.streams import Key, broken_bag_on_error, read_streams
+from terrafusion.datasets.readers.ros.streams import (
+    Key,
+    Stream,
+    broken_bag_on_error,
+    read_streams,
+    twists,
+    wanted_fields,
+)
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
 from terrafusion.datasets.readers.ros.topics import (
     FIX,
@@ -37,8 +43,8 @@ from terrafusion.datasets.readers.ros.topics import (
     BagTopic,
     choose_topics,
     joints_given,
+    wheel_advice,
 )
-from terrafusion.datasets.readers.ros.wheel_advice import wheel_advice
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""

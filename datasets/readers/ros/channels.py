@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
-from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -21,7 +20,7 @@ from terrafusion.datasets.core.channels import (
 )
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permuted
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.core.sensors import Rig, with_assumed_sigma
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.ros import topics
@@ -32,7 +31,6 @@ from terrafusion.datasets.readers.ros.joints import (
     steering_joints,
     wheel_joints,
 )
-from terrafusion.datasets.readers.ros.messages import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.ros.static_frames import (
     BASE,
     Mounting,
@@ -41,6 +39,7 @@ from terrafusion.datasets.readers.ros.static_frames import (
     tells_turn,
     turned_by,
 )
+from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import Fixes, located
 
 Datum = tuple[float, float, float]

@@ -10,9 +10,8 @@ from terrafusion.datasets.readers.formats import Request, format_of
 from terrafusion.datasets.readers.open import find_log
 from terrafusion.datasets.readers.ros import ros1, ros2
 from terrafusion.datasets.readers.ros.bag import chosen_topics, opened_bag, topics_of
-from terrafusion.datasets.readers.ros.messages import wanted_fields
 from terrafusion.datasets.readers.ros.static_frames import STATIC
-from terrafusion.datasets.readers.ros.streams import read_streams
+from terrafusion.datasets.readers.ros.streams import read_streams, wanted_fields
 from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
 

@@ -19,12 +19,17 @@ from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, Layouts, wheel_columns
-from terrafusion.datasets.readers.csv_table import CsvTable
+from terrafusion.datasets.readers.channel_tables import (
+    COLUMNS,
+    ChannelReader,
+    CsvTable,
+    Layouts,
+    wheel_columns,
+)
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
-from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
+from terrafusion.datasets.readers.ros.streams import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.topics import (
     FIELD,
     IMU,

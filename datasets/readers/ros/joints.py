@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Steering, Wheels
-from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.readers.ros.streams import Stream
 
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _ENDS = {"front": "front", "f": "front", "rear": "rear", "back": "rear", "b": "rear", "hind": "rear"}

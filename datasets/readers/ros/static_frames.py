@@ -11,7 +11,7 @@ from terrafusion.datasets.core.conventions import BODY_AXES
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.readers.ros.streams import Stream
 
 BASE = "base_link"
 """Frame of the body in a bag, by REP-105."""

@@ -9,7 +9,7 @@ from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together, sorting
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
-from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.readers.ros.streams import Stream
 
 Times = dict[str, TimesNs]
 """Times (N,) by channel."""

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
-from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
+from terrafusion.datasets.core.sensors import with_assumed_sigma
 from terrafusion.datasets.readers.formats import Request
 
 Datum = tuple[float, float, float]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import TimesNs, distinct
-from terrafusion.datasets.core.assumed_sigma import with_assumed_sigma
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -18,8 +17,14 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
-from terrafusion.datasets.readers.csv_table import CsvTable
+from terrafusion.datasets.core.sensors import with_assumed_sigma
+from terrafusion.datasets.readers.channel_tables import (
+    GNSS_SIGMA,
+    GNSS_VELOCITY,
+    QUATERNION,
+    ChannelReader,
+    CsvTable,
+)
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
@@ -33,10 +38,9 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
 )
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
 from terrafusion.datasets.readers.text.row_times import row_times
-from terrafusion.datasets.readers.text.text_columns import TextColumns
+from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
 from terrafusion.datasets.readers.text.units import units_of
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")

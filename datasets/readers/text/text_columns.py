@@ -1,4 +1,4 @@
-"""Columns of a plain text table, and where its header is."""
+"""Columns of a plain table: of text, and where its header is; of Parquet, by pyarrow, which is optional."""
 
 import re
 from collections.abc import Iterator
@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
     TextLayout,
     head_lines,
@@ -121,3 +123,134 @@ def _is_row(cells: list[str]) -> bool:
     except ValueError:
         return False
     return True
+
+
+class ParquetColumns:
+    """Columns of one file; errors name the file and the column.
+
+    Raises:
+        DataError: pyarrow is not installed, or the file is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import pyarrow.parquet
+        except ImportError:
+            raise DataError(
+                "Parquet needs pyarrow, which is not installed",
+                remedy='install it with: pip install "terrafusion[parquet]"',
+            ) from None
+        self.path = path
+        self._refused = (pyarrow.ArrowException, OSError, ValueError, OverflowError)
+        try:
+            self._file = pyarrow.parquet.ParquetFile(path)
+        except self._refused as error:
+            raise self._damaged(error) from None
+        self.names: list[str] = list(self._file.schema_arrow.names)
+        self.rows: int = self._file.metadata.num_rows
+        limits.check_columns(len(self.names))
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise DataError("has no columns, or two of one name", remedy="name each column once")
+        self._table: Any = None
+
+    def read(self, names: list[str]) -> None:
+        """Read these columns; texts stay packed until they are asked for."""
+        size = self.path.stat().st_size
+        limits.check_table(self.rows, len(names), size)
+        limits.check_expansion(self._stored_bytes(names), size)
+        self._check_kinds(names)
+        try:
+            self._table = self._reopened(names).read(columns=names)
+        except self._refused as error:
+            raise self._damaged(error) from None
+
+    def _check_kinds(self, names: list[str]) -> None:
+        """Refuse columns of lists: rows say nothing about how much they hold."""
+        import pyarrow as pa
+
+        for name in names:
+            kind = self._file.schema_arrow.field(name).type
+            if pa.types.is_nested(kind):
+                what = f"column '{shown(name)}' holds {shown(str(kind))}, no numbers or texts"
+                raise DataError(what, remedy="write it as double or string")
+
+    def _stored_bytes(self, names: list[str]) -> int:
+        """Bytes of the columns' pages when unpacked, by the file's own account."""
+        about, asked = self._file.metadata, set(names)
+        return sum(
+            column.total_uncompressed_size
+            for group in map(about.row_group, range(about.num_row_groups))
+            for column in map(group.column, range(group.num_columns))
+            if column.path_in_schema in asked
+        )
+
+    def _reopened(self, names: list[str]) -> Any:
+        """The file with equal texts kept once: a text that many rows repeat takes a few bytes in the file."""
+        import pyarrow as pa
+        import pyarrow.parquet
+
+        kinds = {name: self._file.schema_arrow.field(name).type for name in names}
+        texts = [n for n, kind in kinds.items() if pa.types.is_string(kind) or pa.types.is_large_string(kind)]
+        return pyarrow.parquet.ParquetFile(self.path, read_dictionary=texts)
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """A column of numbers (N,), NaN where it is null."""
+        import pyarrow as pa
+
+        column = self._table.column(name)
+        kind = column.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+            raise DataError(f"column '{name}' holds {kind}, no numbers", remedy="write it as double")
+        values = np.asarray(column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), dtype=float)
+        if np.isinf(values).any():
+            row = int(np.flatnonzero(np.isinf(values))[0])
+            raise DataError(f"column '{name}' is infinite in row {row + 1}", remedy="leave it null")
+        return values
+
+    def texts(self, name: str) -> NDArray[Any]:
+        """A column as texts (N,), "" where it is null."""
+        coded = self._table.column(name).dictionary_encode()
+        parts = [np.zeros(0, dtype=object)]
+        for chunk in coded.chunks:
+            words = ["" if x is None else str(x) for x in [*chunk.dictionary.to_pylist(), None]]
+            places = chunk.indices.fill_null(len(words) - 1).to_numpy(zero_copy_only=False)
+            parts.append(np.array(words, dtype=object)[places])
+        return np.concatenate(parts)
+
+    def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None:
+        """A column of times in ns (N,); None where it holds texts.
+
+        Numbers are in `unit`; typed time stamps carry their own, and are in UTC.
+        """
+        import pyarrow as pa
+
+        column = self._table.column(name)
+        kind = column.type
+        if column.null_count:
+            raise DataError(f"{column.null_count} rows have no '{name}'", remedy="remove them")
+        try:
+            if pa.types.is_timestamp(kind):
+                return np.asarray(column.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy())
+            if pa.types.is_integer(kind):
+                whole = column.cast(pa.int64()).to_numpy()
+                if max(int(whole.max(initial=0)), -int(whole.min(initial=0))) < 2**63 // NS_PER.get(unit, 1):
+                    return np.asarray(whole * NS_PER.get(unit, 1))
+                raise OverflowError
+        except self._refused:
+            raise self._no_time(name, unit) from None
+        if not pa.types.is_floating(kind):
+            return None
+        with np.errstate(over="ignore"):
+            ns = self.numbers(name) * NS_PER.get(unit, 1)
+        if not (np.abs(ns) < 9e18).all():
+            raise self._no_time(name, unit)
+        return np.rint(ns).astype(np.int64)
+
+    def _no_time(self, name: str, unit: str) -> DataError:
+        return DataError(
+            f"column '{name}' holds times that do not fit into 64 bits of ns",
+            remedy=f"is the unit {unit}?",
+        )  # fmt: skip
+
+    def _damaged(self, error: BaseException) -> DataError:
+        return DataError(f"no readable Parquet: {error}"[:200], remedy="write it again")

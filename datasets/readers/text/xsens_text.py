@@ -29,8 +29,15 @@ from terrafusion.datasets.readers.delimited import (
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import row_times
-from terrafusion.datasets.readers.text.xsens_clock import UTC, clock_of
-from terrafusion.datasets.readers.text.xsens_motion import ACC, ATTITUDES, GYR, INCREMENTS, inertial
+from terrafusion.datasets.readers.text.xsens_motion import (
+    ACC,
+    ATTITUDES,
+    GYR,
+    INCREMENTS,
+    UTC,
+    clock_of,
+    inertial,
+)
 
 COUNTERS = ("PacketCounter", "Counter")
 TICKS = "SampleTimeFine"

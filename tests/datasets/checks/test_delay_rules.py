@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import delays
-from terrafusion.datasets.checks.bootstrap_interval import BootstrapInterval
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.checks.motion import Signal
+from terrafusion.datasets.checks.motion import Pair, Signal
 from terrafusion.datasets.checks.path_model import path_model
-from terrafusion.datasets.checks.sensor_pairs import Pair
+from terrafusion.datasets.core.bootstrap import BootstrapInterval
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 from tests.datasets.conftest import make_drive

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import scale
-from terrafusion.datasets.checks.bootstrap_interval import BootstrapInterval
 from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.path import PathScale
+from terrafusion.datasets.core.bootstrap import BootstrapInterval
 from terrafusion.datasets.core.recording import Overrides, Recording
 from tests.datasets.conftest import RADIUS_M, make_drive
 

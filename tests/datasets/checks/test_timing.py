@@ -12,7 +12,7 @@ import pytest
 
 from terrafusion.datasets.checks import CheckContext, Finding, repair, run_checks
 from terrafusion.datasets.checks.delays import offset_finding, sensor_lags
-from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
+from terrafusion.datasets.checks.motion import far_lag, signal_pairs
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import ClockJump, Recording
