@@ -191,11 +191,11 @@ def test_log_folder_columns_are_told() -> None:
 def test_formats_and_units_are_told() -> None:
     """Every format, unit and key of the column map stands in the document of formats."""
     from terrafusion.datasets.readers import formats
-    from terrafusion.datasets.readers.text import column_map, units
+    from terrafusion.datasets.readers.text import column_map
 
     text = (ROOT / "docs" / "reference" / "formats.md").read_text(encoding="utf-8")
     words = [form.name for form in formats.FORMATS] + [
-        unit for known in units.UNITS.values() for unit in known
+        unit for known in column_map.UNITS.values() for unit in known
     ]
     words += [*column_map.TIME_UNITS, *column_map.EPOCHS, *filter(None, column_map.FIX_CODES)]
     for word in words:

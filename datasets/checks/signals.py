@@ -21,8 +21,8 @@ from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
-from terrafusion.datasets.core.paired_sides import sampled_apart
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.wrapped_angles import sampled_apart
 
 MEASURED = {
     "wheels": ("speed",),

@@ -30,8 +30,8 @@ from terrafusion.datasets.core.bootstrap import (
 )
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.wrapped_angles import paired_sides, sampled_apart
 
 DEAD, LEAST_R, ODD_SCALE = 0.02, 0.9, 0.15
 """Speed of a wheel over its partner's below which it is dead; correlation and scale error of an odd one."""

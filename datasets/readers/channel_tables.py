@@ -29,11 +29,16 @@ from terrafusion.datasets.core.channels import (
     Wheels,
 )
 from terrafusion.datasets.core.errors import DataError, errors_of
-from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.sensors import Rig, with_assumed_sigma
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
+from terrafusion.datasets.core.wrapped_angles import (
+    paired_sides,
+    sampled_apart,
+    speeds_of,
+    unwrapped_alone,
+    unwrapped_beside_speeds,
+)
 from terrafusion.datasets.readers.delimited import Columns, TextLayout, not_a_table, read_columns, read_text
 from terrafusion.datasets.readers.log_meta import Meta
 

@@ -19,10 +19,9 @@ from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.writers import ros_messages as ros
-from terrafusion.datasets.writers.log_folder import vehicle_file
+from terrafusion.datasets.writers.log_folder import OutputTable, meta_of, tables_of, vehicle_file, writing
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
 from terrafusion.datasets.writers.mcap_file import Definition, TopicMessages, write_mcap_file
-from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.delimited import head_lines, split
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.number_rows import NumberRows, put_in_time, read_rows
+from terrafusion.datasets.readers.text.rows import NumberRows, put_in_time, read_rows
 
 COLUMNS = {
     "imu": ("time", "wx", "wy", "wz", "ax", "ay", "az"),

@@ -23,7 +23,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import META, truth_contents
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.readers.text.rows import row_times
 
 MAGIC = b"\x93NUMPY"
 LOG, POSE = "processed_log", "global_pose"

@@ -20,7 +20,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.number_rows import NumberRows, are_numbers, put_in_time, read_rows
+from terrafusion.datasets.readers.text.rows import NumberRows, are_numbers, put_in_time, read_rows
 
 POSE = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 COLUMNS = {

@@ -5,8 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS
-from terrafusion.datasets.readers.text.units import units_of
+from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, units_of
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""

@@ -29,7 +29,7 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
+from terrafusion.datasets.readers.text.rows import RowTimes, row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
 POSITIONS = {

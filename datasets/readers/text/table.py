@@ -36,12 +36,12 @@ from terrafusion.datasets.readers.text.column_map import (
     MappedColumn,
     contract_map,
     read_column_map,
+    units_of,
 )
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
-from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.readers.text.rows import row_times
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
-from terrafusion.datasets.readers.text.units import units_of
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 

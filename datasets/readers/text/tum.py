@@ -12,7 +12,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.delimited import BLANKS, TextLayout, head_lines, read_columns, read_text
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.readers.text.rows import row_times
 
 COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 NORM_TOLERANCE = 0.01

@@ -28,7 +28,7 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
-from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.readers.text.rows import row_times
 from terrafusion.datasets.readers.text.xsens_motion import (
     ACC,
     ATTITUDES,

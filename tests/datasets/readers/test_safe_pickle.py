@@ -17,7 +17,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open as open_module
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.readers.formats import Format
-from terrafusion.datasets.readers.sets.safe_pickle import numbers, read_table
+from terrafusion.datasets.readers.sets.norlab_pickle import numbers, read_table
 from tests.datasets.conftest import CatalogWith
 
 FRAME = pd.DataFrame({"a": np.arange(4.0), "text": ["1", "2.5", "", "-3"], "b": [1, 2, 3, 4]})

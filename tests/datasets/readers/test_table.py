@@ -18,9 +18,8 @@ from terrafusion.datasets.core.errors import ConfigError, DataError, Terrafusion
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import files_of, open_recording
-from terrafusion.datasets.readers.text.column_map import FIELDS
+from terrafusion.datasets.readers.text.column_map import FIELDS, UNITS, units_of
 from terrafusion.datasets.readers.text.proposed_map import starter_map
-from terrafusion.datasets.readers.text.units import UNITS, units_of
 
 START_NS = 1_700_000_000_123_456_789
 GYRO_MAP = "time: {column: t}\nchannels: {imu: {gyro_z_radps: wz}}\n"

@@ -1,15 +1,17 @@
-"""Files of nothing but numbers, one row a time, of known columns: every cell there and finite."""
+"""Files of nothing but numbers, one row a time, of known columns; times in order, repaired, or refused."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
-from terrafusion.datasets.core.clock import repair_together, sorting
+from terrafusion.datasets.core.clock import repair, repair_together, sorting
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.recording import ClockJump
@@ -21,6 +23,7 @@ from terrafusion.datasets.readers.delimited import (
     read_text,
     split,
 )
+from terrafusion.datasets.readers.formats import Request
 
 MAX_T_NS = 4 * 10**18
 """A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""
@@ -137,3 +140,53 @@ def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, .
     if sorted(names) != sorted(columns):
         raise DataError(f"the header is '{shown(line)}'", remedy=f"give {', '.join(columns)}")
     return names
+
+
+@dataclass(frozen=True, eq=False)
+class RowTimes:
+    """Times that never decrease.
+
+    Attributes:
+        t_ns: (N,) int64.
+        order: rows of the file in the order of `t_ns`, a slice where nothing changed places.
+        jumps, notes: what was repaired.
+    """
+
+    t_ns: TimesNs
+    order: Any = field(default_factory=lambda: slice(None))
+    jumps: tuple[ClockJump, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def jumps_of(self, channels: Iterable[str]) -> tuple[ClockJump, ...]:
+        """The jumps as those of each of the channels that are in these rows."""
+        return tuple(dataclasses.replace(jump, channel=name) for name in channels for jump in self.jumps)
+
+
+def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
+    """The times of a file's rows as a recording needs them.
+
+    Args:
+        request: the file, and whether clocks are repaired.
+        channel: name of the channel or clock, for errors and jumps.
+        t_ns: (N,) int64 in the order of the rows.
+
+    Raises:
+        DataError: time runs backwards, and no repair was asked for or none is possible.
+    """
+    back = np.flatnonzero(t_ns[1:] < t_ns[:-1])
+    if not back.size:
+        return RowTimes(t_ns)
+    if not request.repair_clock:
+        i = int(back[0])
+        raise DataError(
+            f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}",
+            channel=channel,
+            time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9,
+            remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
+        )
+    repaired, jumps = repair(t_ns, channel)
+    late = sorting(repaired, channel)
+    if late is None:
+        return RowTimes(repaired, jumps=jumps)
+    order, note = late
+    return RowTimes(repaired[order], order, jumps, (note,))
