@@ -102,6 +102,17 @@ def grouped(numbers: NDArray[Any], wanted: Groups) -> Iterator[tuple[int, Places
             yield group, rows
 
 
+def batches_of(messages: Sequence[tuple[int, int, bytes]], wanted: Groups) -> Iterator[MessageBatch]:
+    """Messages, each as the number of its source, receipt time (ns) and bytes, by group."""
+    numbers, times, blobs = zip(*messages, strict=True)
+    receipt_ns = np.array(times, dtype=np.int64)
+    sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
+    starts = np.cumsum(sizes) - sizes
+    data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
+    for group, rows in grouped(np.array(numbers, dtype=np.int64), wanted):
+        yield MessageBatch(group, data, starts[rows], sizes[rows], receipt_ns[rows])
+
+
 def normal_type(name: str) -> str:
     """`package/msg/Type` of a type's name in either ROS."""
     parts = name.split("/")

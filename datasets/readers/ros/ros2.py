@@ -23,8 +23,8 @@ from terrafusion.datasets.readers.ros.raw import (
     BagSource,
     Groups,
     MessageBatch,
+    batches_of,
     decompress,
-    grouped,
     normal_type,
     zstd,
 )
@@ -112,15 +112,9 @@ class Db3File:
         unpacked = 0
         rows = self._run(query, topics)
         while block := rows.fetchmany(FETCHED_ROWS):
-            numbers, times, blobs = zip(*block, strict=True)
-            ids, receipt_ns = np.array(numbers, dtype=np.int64), np.array(times, dtype=np.int64)
-            sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
-            starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-            unpacked += int(sizes.sum())
+            unpacked += sum(len(blob) for *_, blob in block)
             limits.check_expansion(unpacked, self._bytes)
-            data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
-            for group, mine in grouped(ids, wanted):
-                yield MessageBatch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
+            yield from batches_of(block, wanted)
 
 
 def _refuse_cut(path: Path) -> None:

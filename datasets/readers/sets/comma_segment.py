@@ -9,7 +9,6 @@ camera's pose: ECEF positions, orientations as quaternions w, x, y, z. Any file 
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,19 +87,20 @@ def read(request: Request) -> list[Recording]:
     gnss, datum, about_fixes = _gnss(request, found.get("GNSS/live_gnss_ublox"))
     imu, about_imu = _imu({n: signal for n, signal in found.items() if SIGNALS[n][1] == "imu"})
     truth, datum = _truth(request, frames, clock_ns, datum)
-    channels: dict[str, Any] = {"imu": imu, "gnss": gnss, "truth": truth}
-    if (wheels := found.get("CAN/wheel_speed")) is not None:
-        channels["wheels"] = Wheels(wheels.t_ns, wheels.value, Wheels.LAYOUTS[1], "mps")
-    if (steering := found.get("CAN/steering_angle")) is not None:
-        channels["steering"] = Steering(steering.t_ns, np.radians(steering.value), ("steering_wheel",))
-    firsts = [int(channel.t_ns[0]) for channel in channels.values() if channel is not None and len(channel)]
+    wheels, steering = found.get("CAN/wheel_speed"), found.get("CAN/steering_angle")
+    firsts = [int(one.t_ns[0]) for one in (imu, gnss, truth, wheels, steering) if one is not None]
     if not firsts:
         remedy = f"give a folder that holds {', '.join(f'{LOG}/{name}' for name in SIGNALS)}"
         raise DataError("no array of the segment is there", file=folder, remedy=remedy)
+    angle = Steering(steering.t_ns, np.radians(steering.value), ("steering_wheel",)) if steering else None
     recording = Recording(
         name=folder.resolve().name,
         start_ns=min(firsts),
-        **channels,
+        imu=imu,
+        gnss=gnss,
+        truth=truth,
+        wheels=Wheels(wheels.t_ns, wheels.value, Wheels.LAYOUTS[1], "mps") if wheels else None,
+        steering=angle,
         datum=datum,
         truth_channels=truth_contents(truth) if truth is not None else (),
         truth_frame="antenna",
@@ -114,10 +114,7 @@ def read(request: Request) -> list[Recording]:
 
 def _segment_of(path: Path) -> Path | None:
     """The segment's folder of one of its arrays."""
-    for parent in path.parents:
-        if parent.name in (LOG, POSE):
-            return parent.parent
-    return None
+    return next((parent.parent for parent in path.parents if parent.name in (LOG, POSE)), None)
 
 
 def _array(path: Path, columns: int) -> Array | None:
@@ -139,9 +136,7 @@ def _array(path: Path, columns: int) -> Array | None:
 
 def _signal(folder: Path, columns: int) -> Signal | None:
     t_s, value = _array(folder / "t", 1), _array(folder / "value", columns)
-    if t_s is None or value is None:
-        return None
-    return Signal(_boot_ns(folder / "t", t_s, len(value)), value)
+    return None if t_s is None or value is None else Signal(_boot_ns(folder / "t", t_s, len(value)), value)
 
 
 def _boot_ns(path: Path, t_s: Array, rows: int) -> TimesNs:
@@ -159,16 +154,14 @@ def _unix_less_boot(gnss: Signal | None, frames: dict[str, Array]) -> tuple[np.i
         if 0.0 <= week < 1e5 and 0.0 <= of_week < WEEK_S:
             gps_ns = np.array([round(week) * WEEK_S * 10**9 + round(of_week * 1e9)])
             boot_ns = np.rint(frames["frame_times"][0, 0] * 1e9).astype(np.int64)
-            return gps_to_unix_ns(gps_ns)[0] - boot_ns, [
-                "times: the device's clock is set by the GPS times of the frames"
-            ]
+            notes = ["times: the device's clock is set by the GPS times of the frames"]
+            return gps_to_unix_ns(gps_ns)[0] - boot_ns, notes
     utc = gnss.value[:, 3] if gnss is not None else np.zeros(0)
     if gnss is not None and _is_utc_ms(utc).any():
         held = _is_utc_ms(utc)
         late = np.median(gnss.t_ns[held] - np.rint(utc[held] * 1e6).astype(np.int64))
-        return np.int64(-late), [
-            "times: the device's clock is set by the receiver's UTC, which comes some 0.1 s late"
-        ]
+        notes = ["times: the device's clock is set by the receiver's UTC, which comes some 0.1 s late"]
+        return np.int64(-late), notes
     return np.int64(0), ["times: no UTC in the segment; they count from the start of the device"]
 
 

@@ -8,12 +8,9 @@ crafted pickle can crash the process. As a catalogue may come from someone else,
 of a DataFrame and no other function.
 """
 
-import dataclasses
 import hashlib
 import io
 import os
-import pickle
-import struct
 import warnings
 from pathlib import Path
 from typing import Any
@@ -36,6 +33,7 @@ from terrafusion.datasets.readers.formats import Request
 Table = dict[str, NDArray[Any]]
 
 SUFFIXES = (".pkl", ".pickle")
+SIDES = ("left", "right")
 ROBOT = "warthog"
 GROUNDS = {"asphalt": "asphalt", "grass": "grass", "gravel": "gravel", "ice": "ice", "sand": "loose_sand"}
 """Ground in the folder's name -> terrain."""
@@ -129,7 +127,7 @@ def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:
         name=path.parent.name,
         start_ns=int(t_ns[0]),
         command=_command_of_drive(t_ns, table, notes),
-        wheels=Wheels(t_ns[live], speed[live], ("left", "right"), "radps"),
+        wheels=Wheels(t_ns[live], speed[live], SIDES, "radps"),
         imu=imu.select(_since_first(imu.accel_mps2.any(axis=1), "imu", "its first message", notes)),
         motor=motor,
         terrain=_labels(int(t_ns[0]), terrain),
@@ -156,19 +154,17 @@ def _since_first(known: Any, channel: str, what: str, notes: list[str]) -> slice
 
 def _motor(t_ns: TimesNs, table: Table, notes: list[str]) -> tuple[Motor | None, slice]:
     """The motors, and the rows from which on they, and the wheels' encoders with them, are on."""
-    if not {f"{side}_wheel_{what}" for side in ("left", "right") for what in ("voltage", "current")} <= set(
-        table
-    ):
+    voltages, currents = ([f"{side}_wheel_{what}" for side in SIDES] for what in ("voltage", "current"))
+    if not {*voltages, *currents} <= set(table):
         notes.append("motor: no currents and voltages in the file")
         return None, slice(None)
-    voltage = _stack(table, "left_wheel_voltage", "right_wheel_voltage")
+    voltage = _stack(table, *voltages)
     on = (voltage != 0.0).all(axis=1)
     if not on.any():
         notes.append("motor: the voltages are zero throughout; left out")
         return None, slice(None)
     live = _since_first(on, "wheels, motor", "the motors were on", notes)
-    current = _stack(table, "left_wheel_current", "right_wheel_current")
-    return Motor(t_ns[live], current[live], voltage[live]), live
+    return Motor(t_ns[live], _stack(table, *currents)[live], voltage[live]), live
 
 
 def _command_of_drive(t_ns: TimesNs, table: Table, notes: list[str]) -> Command | None:
@@ -205,36 +201,30 @@ def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recordi
     begins = numbers(table["transitory_state_mask"]) == 1.0
     if not len(begins):
         raise DataError("holds no windows", remedy="give an unchanged table")
-    return [
-        dataclasses.replace(
-            _window({name: signal[k] for name, signal in signals.items()}, begins[: k + 1], conventions),
-            name=f"{path.parent.name}#{k}",
-            terrain=_labels(0, terrain),
-            terrain_name=terrain,
-            notes=tuple(notes),
+    recordings = []
+    for k, begin in enumerate(begins.tolist()):
+        part = _part_of_step(begins[: k + 1])
+        t_ns = (part * WINDOW_SAMPLES + np.arange(WINDOW_SAMPLES, dtype=np.int64)) * SAMPLE_NS
+        window = {name: signal[k] for name, signal in signals.items()}
+        gyro = np.pad(window["rate"], ((0, 0), (2, 0)), constant_values=np.nan)
+        step, state = int(begins[: k + 1].sum()), "the command just changed" if begin else "steady command"
+        recordings.append(
+            Recording(
+                name=f"{path.parent.name}#{k}",
+                start_ns=int(t_ns[0]),
+                command=_command_of_window(t_ns, window["commanded"], conventions),
+                wheels=Wheels(t_ns, window["sides"], SIDES, "radps"),
+                imu=Imu(t_ns, gyro, window["accel"]),
+                terrain=_labels(0, terrain),
+                terrain_name=terrain,
+                truth=Trajectory(t_ns, window["position"], rpy_to_quaternion(window["rpy"])),
+                truth_channels=TRUTH_CHANNELS,
+                description=f"step {step}, window {part + 1} of {WINDOWS_A_STEP}, {state}; "
+                "the truth starts at its own origin",
+                notes=tuple(notes),
+            )
         )
-        for k in range(len(begins))
-    ]
-
-
-def _window(signals: dict[str, Array], begins: Mask, conventions: Conventions) -> Recording:
-    """The last window of those whose command `begins` (k,) there."""
-    part = _part_of_step(begins)
-    t_ns = (part * WINDOW_SAMPLES + np.arange(WINDOW_SAMPLES, dtype=np.int64)) * SAMPLE_NS
-    gyro = np.full((WINDOW_SAMPLES, 3), np.nan)
-    gyro[:, 2:] = signals["rate"]
-    state = "the command just changed" if begins[-1] else "steady command"
-    return Recording(
-        name="",
-        start_ns=int(t_ns[0]),
-        command=_command_of_window(t_ns, signals["commanded"], conventions),
-        wheels=Wheels(t_ns, signals["sides"], ("left", "right"), "radps"),
-        imu=Imu(t_ns, gyro, signals["accel"]),
-        truth=Trajectory(t_ns, signals["position"], rpy_to_quaternion(signals["rpy"])),
-        truth_channels=TRUTH_CHANNELS,
-        description=f"step {int(begins.sum())}, window {part + 1} of {WINDOWS_A_STEP}, {state}; "
-        "the truth starts at its own origin",
-    )
+    return recordings
 
 
 def _signals(table: Table, *names: str) -> Array:
@@ -320,21 +310,6 @@ ALLOWED = {
 }
 """What pandas of any version pickles a DataFrame of numbers and texts with."""
 
-_BROKEN = (
-    pickle.UnpicklingError,
-    EOFError,
-    ImportError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    ArithmeticError,
-    AssertionError,
-    RecursionError,
-    MemoryError,
-    struct.error,
-)
-
 
 def read_table(data: bytes) -> dict[str, NDArray[Any]]:
     """The columns (N,) of a pickled DataFrame by name: numbers, or objects that are texts or numbers.
@@ -364,17 +339,17 @@ def read_table(data: bytes) -> dict[str, NDArray[Any]]:
             raise DataError("the pickle holds no DataFrame", remedy="pickle a pandas DataFrame")
         if not frame.columns.is_unique or not all(isinstance(name, str) for name in frame.columns):
             raise ValueError("columns without names of their own")
-        return {name: _values(frame[name]) for name in frame.columns}
-    except _BROKEN as error:
+        return {
+            str(name): np.asarray(column.to_numpy(None if isinstance(column.dtype, np.dtype) else object))
+            for name, column in frame.items()
+        }
+    except DataError:
+        raise
+    except Exception as error:  # of unknown origin: whatever the parser raises
         why = f": {shown(str(error))}" if str(error) else ""
         raise DataError(
             f"the pickle cannot be read{why}", remedy="copy it again; it holds no plain DataFrame"
         ) from None
-
-
-def _values(column: Any) -> NDArray[Any]:
-    kind = column.dtype
-    return np.asarray(column.to_numpy() if isinstance(kind, np.dtype) else column.to_numpy(dtype=object))
 
 
 def numbers(column: NDArray[Any]) -> NDArray[np.float64]:

@@ -66,28 +66,29 @@ def read(request: Request) -> list[Recording]:
 
 def _recording(file: MatlabFile, request: Request) -> Recording:
     t_imu, t_wheels = _clock(file, "tTimu"), _clock(file, "tTodom")
+    positions = [f"{name}Pos" for name in WHEELS]
     wheels = Wheels(
         seconds_to_ns(t_wheels),
         _columns(file, [f"{name}Vel" for name in WHEELS], len(t_wheels), "tTodom"),
         NAMES,
         "radps",
-        _columns(file, [f"{name}Pos" for name in WHEELS], len(t_wheels), "tTodom")
-        if all(file.has(f"{name}Pos") for name in WHEELS)
-        else None,
+        _columns(file, positions, len(t_wheels), "tTodom") if all(map(file.has, positions)) else None,
     )
-    imu = Imu(
-        seconds_to_ns(t_imu),
-        _columns(file, ["Gx", "Gy", "Gz"], len(t_imu), "tTimu"),
-        _columns(file, ["Ax", "Ay", "Az"], len(t_imu), "tTimu"),
-    )
+    gyro, accel = (_columns(file, [f"{kind}{axis}" for axis in "xyz"], len(t_imu), "tTimu") for kind in "GA")
+    imu = Imu(seconds_to_ns(t_imu), gyro, accel)
+    left_out = [name for name in DEAD_RECKONING if file.has(name)]
     recording = Recording(
         name=request.path.stem,
         start_ns=max(int(min(imu.t_ns[0], wheels.t_ns[0])), 0),  # no recording starts before 1970
         wheels=wheels,
         imu=imu,
         description="the rover's own dead reckoning is left out",
-        notes=_left_out(file),
     )
+    if left_out:
+        names = ", ".join(left_out)
+        recording = recording.with_notes(
+            f"{names}: the rover's own dead reckoning in its odom frame, no truth; left out"
+        )
     return _with_fixes(recording, file, request, t_wheels)
 
 
@@ -108,13 +109,6 @@ def _columns(file: MatlabFile, names: list[str], rows: int, clock: str) -> Array
                 remedy="give the variables as they were published",
             )
     return np.stack(columns, axis=-1)
-
-
-def _left_out(file: MatlabFile) -> tuple[str, ...]:
-    found = [name for name in DEAD_RECKONING if file.has(name)]
-    if not found:
-        return ()
-    return (f"{', '.join(found)}: the rover's own dead reckoning in its odom frame, no truth; left out",)
 
 
 def _with_fixes(recording: Recording, file: MatlabFile, request: Request, t_wheels: Array) -> Recording:
@@ -245,16 +239,6 @@ LARGEST = 1e30
 MAGIC = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
-_BROKEN = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    MemoryError,
-    OverflowError,
-)
 
 
 def is_hdf5(head: bytes) -> bool:
@@ -267,7 +251,7 @@ def variables(path: Path) -> set[str] | None:
     try:
         with _file(path) as file:
             return set(file)
-    except _BROKEN:
+    except Exception:  # of unknown origin: whatever the library raises
         return None
 
 
@@ -281,7 +265,9 @@ def opened(path: Path) -> Iterator[MatlabFile]:
     try:
         with _file(path) as file:
             yield MatlabFile(file)
-    except _BROKEN as error:
+    except DataError:
+        raise
+    except Exception as error:
         why = str(error).rpartition("(")[2].split("\n")[0].split(",")[0].rstrip(")")[:100]
         raise DataError(f"the HDF5 cannot be read: {why}", remedy="copy it again; is it complete?") from None
 

@@ -85,15 +85,17 @@ def read(request: Request) -> list[Recording]:
     joined = f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
     notes = [joined, *apart, *clock, *(note for r in rows.values() for note in r.notes)]
     truth, truth_notes = _truth(rows)
+    held = () if truth is None else truth_contents(truth)
     truth_kind = "center" if "center" in rows else "front"
     wheels, wheel_notes = _wheels(rows.get("wheels"), given.kind == "wheels")
+    imu = rows.get("imu")
     recording = Recording(
         name=name or request.path.resolve().parent.name,
         start_ns=max(min(int(r.t_ns[0]) for r in rows.values()), 0),  # no recording starts before 1970
         wheels=wheels,
-        imu=_imu(rows["imu"]) if "imu" in rows else None,
+        imu=Imu(imu.t_ns, imu.values[:, :3], imu.values[:, 3:]) if imu else None,
         truth=truth,
-        truth_channels=_truth_channels(rows, truth),
+        truth_channels=held if "center" in rows else tuple(name for name in held if name != "position"),
         clock_jumps=tuple(
             replace(jump, channel="truth") if jump.channel == truth_kind else jump for jump in jumps
         ),
@@ -157,10 +159,6 @@ def _contemporaries(rows: dict[str, NumberRows], given: str) -> tuple[dict[str, 
     ]
 
 
-def _imu(rows: NumberRows) -> Imu:
-    return Imu(rows.t_ns, rows.values[:, :3], rows.values[:, 3:])
-
-
 def _wheels(rows: NumberRows | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
     """The speed of the wheels; what moves sideways is the velocity of another source."""
     if rows is None:
@@ -172,11 +170,9 @@ def _wheels(rows: NumberRows | None, asked_for: bool) -> tuple[Wheels | None, li
     if not asked_for:
         return None, [f"{rows.path.name} moves sideways: no speed of wheels; left out"]
     vy, vz = rows.values[sideways[0], 1:]
-    raise rows.error(
-        int(sideways[0]),
-        f"wheels that move sideways: vy {vy:g}, vz {vz:g} m/s",
-        "are the columns t, vx, vy, vz? a body velocity of another source is not read as wheels",
-    )
+    what = f"wheels that move sideways: vy {vy:g}, vz {vz:g} m/s"
+    remedy = "are the columns t, vx, vy, vz? a body velocity of another source is not read as wheels"
+    raise rows.error(int(sideways[0]), what, remedy)
 
 
 def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
@@ -191,13 +187,6 @@ def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
     if kind == "front":
         notes.append("truth is the rigid body at the front, ahead of the centre: only its yaw is the robot's")
     return truth, notes
-
-
-def _truth_channels(rows: dict[str, NumberRows], truth: Trajectory | None) -> tuple[str, ...]:
-    if truth is None:
-        return ()
-    held = truth_contents(truth)
-    return held if "center" in rows else tuple(name for name in held if name != "position")
 
 
 def _trajectory(rows: NumberRows) -> tuple[Trajectory, list[str]]:

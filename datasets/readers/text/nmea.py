@@ -41,21 +41,14 @@ KNOT_MPS = 1852.0 / 3600.0
 DAY_NS = 86400 * 10**9
 FIX_OF_QUALITY = {0: Fix.NONE, 1: Fix.SINGLE, 2: Fix.DGPS, 3: Fix.SINGLE, 4: Fix.FIXED, 5: Fix.FLOAT}
 """GGA: 1 GPS, 2 differential, 3 PPS, 4 RTK, 5 float RTK; no fixes are 6 estimated, 7 manual, 8 simulated."""
-FIX_OF_MODE = {
-    "A": Fix.SINGLE,
-    "D": Fix.DGPS,
-    "P": Fix.SINGLE,
-    "R": Fix.FIXED,
-    "F": Fix.FLOAT,
-    "": Fix.SINGLE,
-}
+FIX_OF_MODE = dict.fromkeys(("A", "P", ""), Fix.SINGLE) | {"D": Fix.DGPS, "R": Fix.FIXED, "F": Fix.FLOAT}
 """RMC, from NMEA 2.3 on; E, M, S and N are no fixes."""
 NO_FIX = (6, 7, 8)
 NEAR_EPOCHS = 3
 """Sentences of an epoch may come this many epochs late."""
-CENTURY = 80
-CENTURIES_END = 2200
-"""Two-digit years from here on are of the 1900s."""
+CENTURY, CENTURIES_END = 80, 2200
+"""Two-digit years from the first on are of the 1900s; GPS begins in 1980, 64 bits of ns end in 2262."""
+UNKNOWN = (math.nan, math.nan, math.nan)
 
 
 class _NoTimeError(Exception):
@@ -84,21 +77,9 @@ class Epoch:
     llh: tuple[float, float, float] | None = None
     fix: int = Fix.NONE
     hdop: float = np.nan
-    sigma_enu_m: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    velocity_enu_mps: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    sigma_enu_m: tuple[float, float, float] = UNKNOWN
+    velocity_enu_mps: tuple[float, float, float] = UNKNOWN
     from_gga: bool = False
-
-
-@dataclass(frozen=True)
-class NmeaEpochs:
-    """The epochs with a position, and how many positions are no fixes but estimated or typed in."""
-
-    epochs: list[Epoch]
-    left_out: int
-
-    def column(self, name: str) -> NDArray[Any]:
-        """A field of all epochs, (N,) or (N, 3)."""
-        return np.array([getattr(epoch, name) for epoch in self.epochs])
 
 
 @dataclass
@@ -122,7 +103,7 @@ class _Log:
         return self.epochs[-1]
 
 
-def collect(text: str) -> tuple[NmeaEpochs, list[str]]:
+def collect(text: str) -> tuple[list[Epoch], list[str]]:
     """All epochs of a log with a position, and what was wrong with its sentences.
 
     Raises:
@@ -160,27 +141,24 @@ def collect(text: str) -> tuple[NmeaEpochs, list[str]]:
         notes.append(f"gnss: {timeless} sentences of a receiver without time yet; left out")
     if unchecked:
         notes.append(f"gnss: {unchecked} sentences have no checksum; taken as they are")
-    return _with_position(log), notes
-
-
-def _with_position(log: _Log) -> NmeaEpochs:
+    if log.left_out:
+        notes.append(f"gnss: {log.left_out} estimated, manual or simulated positions left out")
     epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", remedy="record GGA or RMC")
     # RMC repeats the position of a GGA with fewer digits
-    return NmeaEpochs([epoch for epoch in epochs if epoch.from_gga] or epochs, log.left_out)
+    return [epoch for epoch in epochs if epoch.from_gga] or epochs, notes
 
 
 def _gga(log: _Log, f: list[str]) -> Epoch:
     quality = int(f[5] or 0)
     if quality not in FIX_OF_QUALITY and quality not in NO_FIX:
         raise ValueError(quality)
-    position = (np.nan, np.nan, np.nan)
+    position = UNKNOWN
     if quality and quality not in NO_FIX:
         height = _float(f[8]) + (_float(f[10]) if f[10] else 0.0)  # above the geoid, and that above WGS-84
         position = (_angle(f[1], f[2], "NS"), _angle(f[3], f[4], "EW"), height)
-    hdop = _float(f[7])
-    epoch = log.at(f[0])
+    hdop, epoch = _float(f[7]), log.at(f[0])
     if epoch.from_gga:
         return epoch  # a second talker repeats the epoch
     log.left_out += quality in NO_FIX
@@ -190,19 +168,18 @@ def _gga(log: _Log, f: list[str]) -> Epoch:
 
 
 def _rmc(log: _Log, f: list[str]) -> Epoch:
-    valid = f[1] == "A"
-    position = (np.nan, np.nan, np.nan)
-    if valid:
-        position = (_angle(f[2], f[3], "NS"), _angle(f[4], f[5], "EW"), np.nan)
-    velocity = _velocity(f[6], f[7]) if valid else (np.nan, np.nan, np.nan)
-    day = _date(int(f[8][4:6]), f[8][2:4], f[8][:2]) if f[8] else np.nan
-    mode = f[11] if len(f) > 11 else ""
+    position, velocity, fix = UNKNOWN, UNKNOWN, Fix.NONE
+    if f[1] == "A":
+        position = (_angle(f[2], f[3], "NS"), _angle(f[4], f[5], "EW"), math.nan)
+        velocity = _velocity(f[6], f[7])
+        fix = FIX_OF_MODE.get(f[11] if len(f) > 11 else "", Fix.NONE)
+    day = _date(int(f[8][4:6]), f[8][2:4], f[8][:2]) if f[8] else math.nan
     epoch = log.at(f[0])
     if math.isnan(epoch.date):
         epoch.date = day
     epoch.velocity_enu_mps = velocity
     if epoch.llh is None:
-        epoch.llh, epoch.fix = position, FIX_OF_MODE.get(mode, Fix.NONE) if valid else Fix.NONE
+        epoch.llh, epoch.fix = position, fix
     return epoch
 
 
@@ -214,7 +191,7 @@ def _gst(log: _Log, f: list[str]) -> Epoch:
 
 
 def _zda(log: _Log, f: list[str]) -> Epoch:
-    if f[3] and not 1980 <= int(f[3]) < CENTURIES_END:  # GPS begins in 1980, 64 bits of ns end in 2262
+    if f[3] and not 1980 <= int(f[3]) < CENTURIES_END:
         raise ValueError(f[3])
     day = _date(int(f[3]), f[2], f[1]) if f[3] else np.nan
     epoch = log.at(f[0])
@@ -261,13 +238,7 @@ def _angle(text: str, side: str, sides: str) -> float:
     number = _float(text)
     degrees = number // 100
     minutes = number - 100 * degrees
-    if (
-        side not in sides
-        or not side
-        or number < 0
-        or minutes >= 60
-        or degrees > (90 if "N" in sides else 180)
-    ):
+    if side not in (*sides,) or number < 0 or minutes >= 60 or degrees > (90 if "N" in sides else 180):
         raise ValueError(text)
     angle = float(degrees + minutes / 60)
     return -angle if side == sides[1] else angle
@@ -290,19 +261,13 @@ def _date(year: int, month: str, day: str) -> float:
 def _receipt_s(text: str, at: int) -> float:
     """Unix time in front of a sentence on its line, NaN where there is none."""
     begin = max(text.rfind("\n", max(at - STAMP_CHARACTERS, 0), at) + 1, at - STAMP_CHARACTERS, 0)
-    prefix = text[begin:at]
-    if len(prefix) < 10:
-        return float("nan")
-    unix = UNIX_STAMP.search(prefix)
+    unix, iso = UNIX_STAMP.search(text, begin, at), ISO_STAMP.search(text, begin, at)
     if unix:
         return float(unix[1])
-    iso = ISO_STAMP.search(prefix)
-    if not iso:
-        return float("nan")
     try:
-        return datetime.fromisoformat(iso[0]).replace(tzinfo=UTC).timestamp()
+        return datetime.fromisoformat(iso[0]).replace(tzinfo=UTC).timestamp() if iso else math.nan
     except ValueError:
-        return float("nan")
+        return math.nan
 
 
 SENTENCE = re.compile(rb"\$(?:G[PNLABQI]|BD|QZ|IN)(?:GGA|RMC|GST|ZDA|VTG|GLL|GSA|GSV),")
@@ -343,9 +308,14 @@ def read(request: Request) -> list[Recording]:
     return [recording]
 
 
-def _dated(epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
+def _column(epochs: list[Epoch], name: str) -> NDArray[Any]:
+    """A field of all epochs, (N,) or (N, 3)."""
+    return np.array([getattr(epoch, name) for epoch in epochs])
+
+
+def _dated(epochs: list[Epoch]) -> tuple[NDArray[np.int64], list[str]]:
     """Unix nanoseconds of the epochs: and notes on the source of their date."""
-    day, date = epochs.column("day"), epochs.column("date")
+    day, date = _column(epochs, "day"), _column(epochs, "date")
     if np.isfinite(date).any():
         first_days = date - day  # the date of the log's first day, as each dated epoch has it
         known = np.flatnonzero(np.isfinite(first_days))
@@ -362,28 +332,28 @@ def _dated(epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
             )
         elif abs(off) > 1.0:
             notes.append(f"gnss: dates are {off:.0f} days off the log's own time stamps; not corrected")
-    elif np.isfinite(epochs.column("receipt_s")).any():
+    elif np.isfinite(_column(epochs, "receipt_s")).any():
         first = np.full(len(day), _receipt_days(epochs))
         notes = ["gnss: no sentence has a date; that of the log's own time stamps is taken"]
     else:
         first = np.zeros(len(day))
         notes = ["gnss: no sentence has a date: times are those of day 0, 1970-01-01"]
-    return (day + first).astype(np.int64) * DAY_NS + epochs.column("of_day_ns"), notes
+    return (day + first).astype(np.int64) * DAY_NS + _column(epochs, "of_day_ns"), notes
 
 
-def _receipt_days(epochs: NmeaEpochs) -> float:
+def _receipt_days(epochs: list[Epoch]) -> float:
     """Date of the log's first day by the time stamps in front of the sentences, days since 1970."""
-    first = next((epoch for epoch in epochs.epochs if math.isfinite(epoch.receipt_s)), None)
+    first = next((epoch for epoch in epochs if math.isfinite(epoch.receipt_s)), None)
     if first is None:
         return math.nan
     return float(np.rint((first.receipt_s - first.of_day_ns * 1e-9) / 86400.0) - first.day)
 
 
-def _fixes(request: Request, epochs: NmeaEpochs, t_ns: TimesNs) -> tuple[Fixes, list[str]]:
+def _fixes(request: Request, epochs: list[Epoch], t_ns: TimesNs) -> tuple[Fixes, list[str]]:
     """The fixes, with HDOP for the sigmas that no GST gives."""
     notes = []
-    fix, hdop = epochs.column("fix").astype(np.uint8), epochs.column("hdop")
-    sigma = epochs.column("sigma_enu_m")
+    fix, hdop = _column(epochs, "fix").astype(np.uint8), _column(epochs, "hdop")
+    sigma = _column(epochs, "sigma_enu_m")
     spec = request.rig.sensors.gnss if request.rig else None
     at_one = np.array([spec.sigma_horizontal_m if spec else ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])
     counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (hdop < UNKNOWN_HDOP)
@@ -392,7 +362,5 @@ def _fixes(request: Request, epochs: NmeaEpochs, t_ns: TimesNs) -> tuple[Fixes, 
         sigma[counted] = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
         used = ", ".join(f"{Fix(k).name.lower()} {at_one[k]:g} m" for k in np.unique(fix[counted]))
         notes.append(f"gnss: {int(counted.sum())} fixes without GST: sigma is HDOP times an assumed {used}")
-    if epochs.left_out:
-        notes.append(f"gnss: {epochs.left_out} estimated, manual or simulated positions left out")
-    velocity = epochs.column("velocity_enu_mps")
-    return Fixes(t_ns, epochs.column("llh"), fix, sigma, velocity), notes
+    velocity = _column(epochs, "velocity_enu_mps")
+    return Fixes(t_ns, _column(epochs, "llh"), fix, sigma, velocity), notes

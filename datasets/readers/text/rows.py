@@ -25,6 +25,7 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 
+REPAIR = "sort the rows, split the log there, or have the clock repaired (--repair-clock)"
 MAX_T_NS = 4 * 10**18
 """A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""
 
@@ -112,8 +113,7 @@ def put_in_time(
             if back.size:
                 by_s = (rows.t_ns[back[0]] - rows.t_ns[back[0] + 1]) * 1e-9
                 what = f"the time of {name} runs backwards by {by_s:.6f} s"
-                remedy = "sort the rows, split the log there, or have the clock repaired (--repair-clock)"
-                raise rows.error(int(back[0]) + 1, what, remedy)
+                raise rows.error(int(back[0]) + 1, what, REPAIR)
         return dict(parts), (), ()
     times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
     notes, out = [], {}
@@ -178,12 +178,8 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
         return RowTimes(t_ns)
     if not request.repair_clock:
         i = int(back[0])
-        raise DataError(
-            f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}",
-            channel=channel,
-            time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9,
-            remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
-        )
+        what = f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}"
+        raise DataError(what, channel=channel, time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9, remedy=REPAIR)
     repaired, jumps = repair(t_ns, channel)
     late = sorting(repaired, channel)
     if late is None:
