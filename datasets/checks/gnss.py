@@ -18,7 +18,7 @@ from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.printable import times
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, CLASS_SIGMA_M
 
 FROZEN_S = 3.0
 AROUND, LEAST_SHARE, SLIP_SHARE = 8, 0.5, 0.25
@@ -303,6 +303,6 @@ def _in_steps(sigma: Array) -> bool:
 
 
 def _times_class_sigma(gnss: Gnss) -> Gnss:
-    usual = np.array([ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])[gnss.fix]
+    usual = CLASS_SIGMA_M[gnss.fix]
     sigma = np.where(_with_sigma(gnss)[:, None], gnss.sigma_enu_m * usual[:, None], gnss.sigma_enu_m)
     return dataclasses.replace(gnss, sigma_enu_m=sigma)

@@ -25,7 +25,7 @@ from terrafusion.datasets.checks.finding import (
 from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
 from terrafusion.datasets.core.arrays import Array, Complex, Mask
-from terrafusion.datasets.core.bootstrap import RESAMPLES, SEED, interval_of, resampled_rows
+from terrafusion.datasets.core.bootstrap import interval_of, resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -255,7 +255,7 @@ def _spread(products: Complex) -> float:
     blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
     if len(blocks) < LEAST_BLOCKS:
         return float(np.inf)
-    drawn = blocks[resampled_rows(len(blocks), RESAMPLES, SEED)].sum(axis=1)
+    drawn = blocks[resampled_rows(len(blocks))].sum(axis=1)
     off = interval_of(0.0, np.angle(drawn * np.conj(blocks.sum())), len(blocks))
     return max(-off.low, off.high)
 

@@ -4,6 +4,7 @@ Several recordings of one robot are pooled: windows of 2 s rarely suffice alone.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -259,11 +260,10 @@ def _aligned(context: CheckContext, lags: Sequence[PairLag]) -> CheckContext:
 
 def _paths(contexts: Sequence[CheckContext]) -> dict[str, float]:
     """Path lengths by channel, summed over the recordings."""
-    total: dict[str, float] = {}
+    total: Counter[str] = Counter()
     for context in contexts:
-        for name, length in _path_lengths(context):
-            total[name] = total.get(name, 0.0) + length
-    return total
+        total.update(dict(_path_lengths(context)))
+    return dict(total)
 
 
 def _path_lengths(context: CheckContext) -> Iterator[tuple[str, float]]:
@@ -295,9 +295,7 @@ def _sigma(contexts: Sequence[CheckContext]) -> SigmaRange | None:
     sigmas = [p.recording.gnss.sigma_enu_m[:, :2].ravel() for p in contexts if p.recording.gnss is not None]
     known = np.concatenate([np.zeros(0), *sigmas])
     known = known[np.isfinite(known)]
-    if not known.size:
-        return None
-    return SigmaRange(float(known.min()), float(np.median(known)), float(known.max()))
+    return SigmaRange(float(known.min()), float(np.median(known)), float(known.max())) if known.size else None
 
 
 def _held(contexts: Sequence[CheckContext]) -> dict[str, UpdateRate]:
@@ -310,12 +308,8 @@ def _held(contexts: Sequence[CheckContext]) -> dict[str, UpdateRate]:
             if span_s > 0.0 and rows > 1:
                 updates = int(true_updates(values, rows).sum())
                 rates.setdefault(name, []).append(((len(t_ns) - 1) / span_s, (updates - 1) / span_s))
-    found = {}
-    for name, pairs in rates.items():
-        rate, update = np.median(np.array(pairs), axis=0).tolist()
-        if update < HELD * rate:
-            found[name] = UpdateRate(rate, update)
-    return found
+    found = {name: UpdateRate(*np.median(np.array(pairs), axis=0).tolist()) for name, pairs in rates.items()}
+    return {name: one for name, one in found.items() if one.update_hz < HELD * one.rate_hz}
 
 
 def _measured(recording: Recording) -> Iterator[tuple[str, TimesNs, Array]]:

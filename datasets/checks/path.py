@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.core.arrays import Array, Complex
-from terrafusion.datasets.core.bootstrap import RESAMPLES, SEED, percentile_interval, resampled_rows
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
 
 SHORTEST_M, SIGMAS, LONGEST_S = 6.0, 20.0, 60.0
@@ -194,7 +194,7 @@ def scale_of(fits: PathFits, source: str) -> PathScale | None:
     if use.sum() < max(LEAST_WINDOWS, 0.5 * len(use)):
         return None
     weight, scale = fits.weight[use], fits.scale[use]
-    draws = resampled_rows(len(scale), RESAMPLES, SEED)
+    draws = resampled_rows(len(scale))
     drawn = (weight * scale)[draws].sum(axis=1) / weight[draws].sum(axis=1)
     low, high = percentile_interval(drawn)
     return PathScale(float(np.sum(weight * scale) / weight.sum()), low, high, int(use.sum()), source)

@@ -16,13 +16,7 @@ from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import cumulative
 from terrafusion.datasets.checks.path import MeasuredPath, driven_and_turned
 from terrafusion.datasets.core.arrays import Array, Complex
-from terrafusion.datasets.core.bootstrap import (
-    RESAMPLES,
-    SEED,
-    BootstrapInterval,
-    interval_of,
-    resampled_rows,
-)
+from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 
 LEAST_WINDOWS, LEAST_CONTRIBUTING, LEAST_ROWS, MOST_HZ = 5, 2.0, 8, 5.0
 """Windows that are needed, those of them that show a number, positions in each, and the rate that more would
@@ -142,7 +136,7 @@ def _fitted(windows: _Windows, start_s: float, usual_s: float, rest: float) -> P
     if len(H) < LEAST_WINDOWS or noise > most_noise * windows.size_m():
         return None
     prior = np.diag(noise**2 / PRIOR**2)
-    draws = resampled_rows(len(H), RESAMPLES, SEED)
+    draws = resampled_rows(len(H))
     right = h[draws].sum(axis=1) - prior @ (unknown - usual)
     drawn = unknown + np.linalg.solve(H[draws].sum(axis=1) + prior, right[..., None])[..., 0]
     scale, delay = (

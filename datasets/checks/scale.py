@@ -13,13 +13,7 @@ from terrafusion.datasets.checks.motion import common_span, runs, wheel_speed, y
 from terrafusion.datasets.checks.path import PathScale, dead_reckoned, measured_paths, path_by, scales
 from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.core.arrays import Array, Complex
-from terrafusion.datasets.core.bootstrap import (
-    RESAMPLES,
-    SEED,
-    BootstrapInterval,
-    interval_of,
-    resampled_rows,
-)
+from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
@@ -216,7 +210,7 @@ def _by_truth(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
     x, y = truth.rates(grid), gyro.rates(grid)
     if min(x.std(), y.std()) <= 0.0 or np.corrcoef(x, y)[0, 1] < LEAST_YAW_R:
         return None
-    draws = np.concatenate([np.arange(len(x))[None], resampled_rows(len(x), RESAMPLES, SEED)])
+    draws = np.concatenate([np.arange(len(x))[None], resampled_rows(len(x))])
     a, b = (values[draws] - values[draws].mean(axis=1, keepdims=True) for values in (x, y))
     slope = np.sqrt((b**2).sum(axis=1) / np.maximum((a**2).sum(axis=1), 1e-12)) - 1.0
     return interval_of(float(slope[0]), slope[1:], len(x)), "the truth's yaw"

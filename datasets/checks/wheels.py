@@ -21,13 +21,7 @@ from terrafusion.datasets.checks.imu import (
 from terrafusion.datasets.checks.path import measured_paths, scales
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.bootstrap import (
-    RESAMPLES,
-    SEED,
-    BootstrapInterval,
-    interval_of,
-    resampled_rows,
-)
+from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
@@ -343,7 +337,7 @@ def radius_difference(context: CheckContext) -> BootstrapInterval | None:
     rows = [blocks == block for block in np.unique(blocks)]
     H = np.array([columns[r].T @ columns[r] for r in rows])
     h = np.array([columns[r].T @ difference[r] for r in rows])
-    draws = np.concatenate([np.arange(len(rows))[None], resampled_rows(len(rows), RESAMPLES, SEED)])
+    draws = np.concatenate([np.arange(len(rows))[None], resampled_rows(len(rows))])
     right = h[draws].sum(axis=1) + pulled
     drawn = np.linalg.solve(H[draws].sum(axis=1) + weight, right[..., None])[:, 0, 0]
     return interval_of(float(drawn[0]), drawn[1:], len(rows))

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 
+RESAMPLES, SEED = 400, 20_240_811
+"""Of every bootstrap of the log checks."""
 
-def resampled_rows(rows: int, resamples: int, seed: int) -> NDArray[np.int64]:
+
+def resampled_rows(rows: int, resamples: int = RESAMPLES, seed: int = SEED) -> NDArray[np.int64]:
     """Row numbers (resamples, rows), drawn with replacement; the same seed gives the same rows."""
     return np.random.default_rng(seed).integers(rows, size=(resamples, rows))
 
@@ -20,10 +23,6 @@ def percentile_interval(samples: NDArray[np.float64], tail_percent: float = 2.5)
     """Percentiles of the resampled statistic (R,) that leave `tail_percent` out at each end."""
     low, high = np.percentile(samples, [tail_percent, 100.0 - tail_percent])
     return float(low), float(high)
-
-
-RESAMPLES, SEED = 400, 20_240_811
-"""Of every bootstrap of the log checks."""
 
 
 @dataclass(frozen=True)

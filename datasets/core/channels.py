@@ -79,6 +79,11 @@ class Channel:
                 remedy="sort the rows or split the log at the clock jump",
             )
 
+    def _check_width(self, field: str, width: int) -> None:
+        values = getattr(self, field)
+        if values is not None and values.shape != (len(self), width):
+            raise ValueError(f"{self.name}: {field} has shape {values.shape}, not ({len(self)}, {width})")
+
     def __len__(self) -> int:
         return len(self.t_ns)
 
@@ -164,10 +169,8 @@ class Wheels(Channel):
         super().__post_init__()
         if self.names not in self.LAYOUTS or self.unit not in ("radps", "mps"):
             raise ValueError(f"wheels: unknown layout {self.names} in {self.unit}")
-        if self.speed.shape != (len(self), len(self.names)):
-            raise ValueError(f"wheels: speed has shape {self.speed.shape} for {len(self.names)} wheels")
-        if self.angle_rad is not None and self.angle_rad.shape != self.speed.shape:
-            raise ValueError(f"wheels: angle_rad has shape {self.angle_rad.shape}, speed {self.speed.shape}")
+        self._check_width("speed", len(self.names))
+        self._check_width("angle_rad", len(self.names))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         table: dict[str, NDArray[Any]] = {
@@ -290,10 +293,7 @@ class Steering(Channel):
         super().__post_init__()
         if self.names not in self.LAYOUTS:
             raise ValueError(f"steering: unknown layout {self.names}")
-        if self.angle_rad.shape != (len(self), len(self.names)):
-            raise ValueError(
-                f"steering: angle_rad has shape {self.angle_rad.shape} for {len(self.names)} names"
-            )
+        self._check_width("angle_rad", len(self.names))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         return {f"{name}_rad": self.angle_rad[:, i] for i, name in enumerate(self.names)}
@@ -327,8 +327,7 @@ class Magnetometer(Channel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.field_t.shape != (len(self), 3):
-            raise ValueError(f"magnetometer: field_t has shape {self.field_t.shape}, not ({len(self)}, 3)")
+        self._check_width("field_t", 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,9 +347,7 @@ class Terrain(Channel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        wanted = (len(self), len(set(self.classes)))
-        if self.probabilities is not None and self.probabilities.shape != wanted:
-            raise ValueError(f"terrain: probabilities have shape {self.probabilities.shape}, not {wanted}")
+        self._check_width("probabilities", len(set(self.classes)))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         table: dict[str, NDArray[Any]] = {"label": self.label}

@@ -30,6 +30,8 @@ ASSUMED_VELOCITY_SIGMA_MPS = 0.5
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
 """Sigma of each horizontal axis by class of fix, where neither log nor vehicle gives it; up has twice that.
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
+CLASS_SIGMA_M = np.array([ASSUMED_SIGMA_M[fix] for fix in Fix])
+"""The same by the number of the class."""
 
 
 def axes_matrix(axes: tuple[str, ...]) -> Array:
@@ -190,7 +192,7 @@ def with_assumed_sigma(rig: Rig | None, sigma: Array, fix: NDArray[np.uint8]) ->
         assumed = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
         origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"
     else:
-        flat = np.array([ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])[fix]
+        flat = CLASS_SIGMA_M[fix]
         assumed = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
         used = ", ".join(f"{Fix(k).name.lower()} {ASSUMED_SIGMA_M[Fix(k)]:g} m" for k in np.unique(fix))
         origin = f"assumed by class, flat: {used}"

@@ -6,7 +6,7 @@ from a bag.
 
 import dataclasses
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder, Datum
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
-from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch
+from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch, batches_of
 from terrafusion.datasets.readers.ros.static_frames import turned_by
 from terrafusion.datasets.readers.ros.streams import Stream, broken_bag_on_error, types_of, wanted_fields
 from terrafusion.datasets.readers.ros.topics import joints_given
@@ -68,16 +68,15 @@ class RawMessage:
         """
         with broken_bag_on_error(self.topic):
             decoder = MessageDecoder(self.msgtype, live_types(self.msgtype), fields, True, self.topic)
-            decoder.add(_batch(0, [self]))
-            receipt_ns, blocks = decoder.result()
-        return Stream(self.topic, self.msgtype, receipt_ns, blocks)
+            return _decoded(decoder, [self])
 
 
-def _batch(group: int, messages: list[RawMessage]) -> MessageBatch:
-    sizes = np.array([len(message.cdr) for message in messages], dtype=np.int64)
-    data = np.frombuffer(b"".join(message.cdr for message in messages), dtype=np.uint8)
-    receipt_ns = np.array([message.receipt_ns for message in messages], dtype=np.int64)
-    return MessageBatch(group, data, np.cumsum(sizes) - sizes, sizes, receipt_ns)
+def _decoded(decoder: MessageDecoder, messages: Sequence[RawMessage]) -> Stream:
+    """Messages of one topic, by a decoder that may know their layout already."""
+    for batch in batches_of([(0, message.receipt_ns, message.cdr) for message in messages], [[0]]):
+        decoder.add(batch)
+    receipt_ns, blocks = decoder.result()
+    return Stream(messages[0].topic, messages[0].msgtype, receipt_ns, blocks)
 
 
 class GatheredMessages:
@@ -89,10 +88,7 @@ class GatheredMessages:
     @property
     def sources(self) -> list[BagSource]:
         """The topics that have messages."""
-        counts: dict[tuple[str, str], int] = {}
-        for message in self.messages:
-            key = message.topic, message.msgtype
-            counts[key] = counts.get(key, 0) + 1
+        counts = Counter((message.topic, message.msgtype) for message in self.messages)
         return [
             BagSource(i, topic, msgtype, DEFINITIONS.get(msgtype, ""), "msg", "cdr", count)
             for i, ((topic, msgtype), count) in enumerate(counts.items())
@@ -100,12 +96,9 @@ class GatheredMessages:
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources."""
-        sources = {source.id: (source.topic, source.msgtype) for source in self.sources}
-        for group, ids in enumerate(wanted):
-            keys = {sources[i] for i in ids}
-            mine = [message for message in self.messages if (message.topic, message.msgtype) in keys]
-            if mine:
-                yield _batch(group, mine)
+        ids = {(source.topic, source.msgtype): source.id for source in self.sources}
+        messages = [(ids[m.topic, m.msgtype], m.receipt_ns, m.cdr) for m in self.messages]
+        return batches_of(messages, wanted) if messages else iter(())
 
     def forget(self, before_ns: int) -> None:
         """Drop what was received earlier, but the only message of a topic: it may have been sent once."""
@@ -235,10 +228,9 @@ class ArrivingMessages:
             if decoder is None:
                 fields = wanted_fields(kind, msgtype)
                 decoder = MessageDecoder(msgtype, live_types(msgtype), fields, True, topic)
-            decoder.add(_batch(0, list(messages)))
-            receipt_ns, blocks = decoder.result()
+            stream = _decoded(decoder, messages)
         self._decoders[kind] = decoder
-        return Stream(topic, msgtype, receipt_ns, blocks)
+        return stream
 
     def _time_of(self, stream: Stream) -> NDArray[np.int64]:
         """Time (1,) of a message: its stamp; without one that of receipt, on the clock of the stamps."""

@@ -22,7 +22,7 @@ from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, UP_FACTOR
+from terrafusion.datasets.core.sensors import CLASS_SIGMA_M, UP_FACTOR
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
@@ -355,7 +355,7 @@ def _fixes(request: Request, epochs: list[Epoch], t_ns: TimesNs) -> tuple[Fixes,
     fix, hdop = _column(epochs, "fix").astype(np.uint8), _column(epochs, "hdop")
     sigma = _column(epochs, "sigma_enu_m")
     spec = request.rig.sensors.gnss if request.rig else None
-    at_one = np.array([spec.sigma_horizontal_m if spec else ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])
+    at_one = np.full(len(Fix), spec.sigma_horizontal_m) if spec else CLASS_SIGMA_M
     counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (hdop < UNKNOWN_HDOP)
     if counted.any():
         flat = (hdop * at_one[fix])[counted]

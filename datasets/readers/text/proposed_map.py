@@ -18,35 +18,23 @@ _WORDS = {
     "km/h": "km/h|kmh|kph|kmph|km_h",
     "cm/s": "cm/s|cmps|cm_s",
     "mm/s": "mm/s|mmps|mm_s",
-    "mph": "mph",
     "kn": "kn|kt|kts|knots",
     "m/s2": "m/s2|m/s^2|m/s²|m/s/s|mps2|m_s2|ms2|ms-2",
-    "g": "g",
-    "mg": "mg",
     "m": "m|meter|metre|meters|metres",
-    "km": "km",
-    "cm": "cm",
-    "mm": "mm",
     "ft": "ft|feet",
     "rad": "rad",
     "deg": "deg|°|degree|degrees",
     "1e-7 deg": "1e-7 deg|1e-7deg|deg*1e7|dege7|e7",
     "rev": "rev|turns",
     "A": "a|amp|amps",
-    "mA": "ma",
-    "Pa": "pa",
-    "hPa": "hpa",
-    "ticks": "ticks?|counts?|pulses?",
+    "ticks": "tick|ticks|count|counts|pulse|pulses",
     "s": "s|sec|secs|seconds",
     "ms": "ms|msec|millis",
     "us": "us|µs|usec|micros",
     "ns": "ns|nsec|nanos|nanosec",
 }
-UNIT_OF = {word.removesuffix("?"): unit for unit, words in _WORDS.items() for word in words.split("|")} | {
-    "tick": "ticks",
-    "count": "ticks",
-    "pulse": "ticks",
-}
+UNIT_OF = {word: unit for unit, words in _WORDS.items() for word in words.split("|")}
+UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", "mA", "Pa", "hPa")}
 """Units as headers write them, in brackets or behind an underscore."""
 TIME_UNITS = ("s", "ms", "us", "ns")
 _BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
