@@ -26,7 +26,12 @@ from terrafusion.datasets.core.yaml_file import read_yaml
 
 HERE = Path(__file__).parent
 DATA_VARIABLE, CATALOG_VARIABLE = "TERRAFUSION_DATA", "TERRAFUSION_CATALOG"
-FILE_COLUMNS = ("set", "recording", "file", "repository", "commit", "path", "sha256", "bytes")
+_CELLS = {
+    "set": r".+", "recording": r".*", "file": r".+", "repository": r"https?://\S+|[\w.-]+/[\w.-]+",
+    "commit": r".*", "path": r".*", "sha256": r"[0-9a-f]{64}", "bytes": r"[0-9]{1,15}",
+}  # fmt: skip
+"""Patterns of the cells of a list of files, by column."""
+FILE_COLUMNS = tuple(_CELLS)
 
 
 @dataclass(frozen=True)
@@ -175,31 +180,17 @@ def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:
 
 def _entry(path: Path, number: int, row: list[str], sets: set[str]) -> CatalogFile:
     """A row as an entry; its file must stay inside the folder it is downloaded to."""
-    if len(row) > len(FILE_COLUMNS):
-        raise ConfigError(
-            f"has {len(row)} cells at line {number}", file=path, remedy=f"give {', '.join(FILE_COLUMNS)}"
-        )
-    fields = dict(zip(FILE_COLUMNS, row, strict=False))
-    wrong = next((name for name in FILE_COLUMNS if name not in fields), "")
-    if not wrong:
-        file = Path(fields["file"])
-        good = {
-            "set": fields["set"] in sets,
-            "file": bool(fields["file"]) and not file.is_absolute() and ".." not in file.parts,
-            "repository": bool(re.fullmatch(r"(https?://\S+|[\w.-]+/[\w.-]+)", fields["repository"])),
-            "sha256": bool(re.fullmatch(r"[0-9a-f]{64}", fields["sha256"])),
-            "bytes": bool(re.fullmatch(r"[0-9]{1,15}", fields["bytes"])),
-        }
-        wrong = next((name for name, fits in good.items() if not fits), "")
-    if wrong:
-        value = f"'{shown(fields[wrong])}'" if wrong in fields else "missing"
-        raise ConfigError(
-            f"column '{wrong}' is {value} at line {number}",
-            file=path,
-            remedy="give a known set, a relative file, owner/name or a URL, and the file's SHA-256 and size",
-        )
-    of_set, recording, name, repository, commit, source, sha256, size = row
-    return CatalogFile(of_set, recording, name, repository, commit, source, sha256, int(size))
+    if len(row) != len(FILE_COLUMNS):
+        remedy = f"give {', '.join(FILE_COLUMNS)}"
+        raise ConfigError(f"has {len(row)} cells at line {number}", file=path, remedy=remedy)
+    for (name, pattern), cell in zip(_CELLS.items(), row, strict=True):
+        outside = name == "file" and (Path(cell).is_absolute() or ".." in Path(cell).parts)
+        if not re.fullmatch(pattern, cell) or outside or (name == "set" and cell not in sets):
+            what = f"column '{name}' is '{shown(cell)}' at line {number}"
+            remedy = "give a known set, a relative file, owner/name or a URL, and the file's SHA-256 and size"
+            raise ConfigError(what, file=path, remedy=remedy)
+    of_set, recording, file, repository, commit, source, sha256, size = row
+    return CatalogFile(of_set, recording, file, repository, commit, source, sha256, int(size))
 
 
 def locate(name: str) -> Path | None:

@@ -1,6 +1,7 @@
-"""Types of arrays, and arrays of texts."""
+"""Types of arrays, rows in time, and arrays of texts."""
 
-from typing import Any
+import dataclasses
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,25 @@ TimesNs = NDArray[np.int64]
 """Times in nanoseconds."""
 Mask = NDArray[np.bool_]
 """Array of truth values."""
+
+
+class TimeRows:
+    """A dataclass of arrays whose first axis is time, `t_ns` (N,)."""
+
+    t_ns: TimesNs
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, rows: Any) -> Self:
+        """The same with the rows of a boolean mask, slice or index array."""
+        changed = {name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return dataclasses.replace(self, **changed)  # type: ignore[type-var]
+
+    def between(self, start_ns: int, end_ns: int) -> Self:
+        """Rows with start_ns <= t < end_ns."""
+        first, last = np.searchsorted(self.t_ns, [start_ns, end_ns], side="left")
+        return self.select(slice(int(first), int(last)))
 
 
 def distinct(texts: NDArray[Any]) -> tuple[list[str], NDArray[np.intp]]:

@@ -10,12 +10,12 @@ import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import (
     BarometerSample,
@@ -51,7 +51,7 @@ class Fix(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Channel:
+class Channel(TimeRows):
     """What all channels share: a clock and rows."""
 
     name: ClassVar[str] = ""
@@ -83,23 +83,6 @@ class Channel:
         values = getattr(self, field)
         if values is not None and values.shape != (len(self), width):
             raise ValueError(f"{self.name}: {field} has shape {values.shape}, not ({len(self)}, {width})")
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def select(self, rows: Any) -> Self:
-        """The same channel with the rows of a boolean mask, slice or index array."""
-        changed = {
-            spec.name: getattr(self, spec.name)[rows]
-            for spec in dataclasses.fields(self)
-            if isinstance(getattr(self, spec.name), np.ndarray)
-        }
-        return dataclasses.replace(self, **changed)
-
-    def between(self, start_ns: int, end_ns: int) -> Self:
-        """Rows with start_ns <= t < end_ns."""
-        first, last = np.searchsorted(self.t_ns, [start_ns, end_ns], side="left")
-        return self.select(slice(int(first), int(last)))
 
     def samples(self) -> Iterator[Message]:
         """One message a row, in order of time."""

@@ -80,8 +80,7 @@ def segment(recording: Recording, begin_s: float, end_s: float) -> Recording:
         )  # fmt: skip
     truth = recording.truth
     if truth is not None:
-        first, last = np.searchsorted(truth.t_ns, [start, end], side="left")
-        truth = truth.select(slice(int(first), int(last))) if last > first else None
+        truth = truth.between(start, end) or None
     jumps = tuple(j for j in recording.clock_jumps if start <= j.t_ns < end)
     name = f"{recording.name}@{begin_s:g}-{end_s:g}"
     return dataclasses.replace(

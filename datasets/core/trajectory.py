@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(TimeRows):
     """Poses of the body (or antenna) in the world frame.
 
     Attributes:
@@ -51,15 +51,6 @@ class Trajectory:
                 time_s=float(self.t_ns[i] - self.t_ns[0]) * 1e-9,
                 remedy="sort the rows and remove repeated times",
             )
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def select(self, rows: Any) -> Trajectory:
-        """The same trajectory with the rows of a boolean mask, slice or index array."""
-        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        chosen: dict[str, Any] = {k: None if v is None else v[rows] for k, v in fields.items()}
-        return Trajectory(**chosen)
 
     def limited_to(self, channels: Collection[str]) -> Trajectory:
         """The same trajectory without what is not in `channels`, of position, yaw, orientation and velocity.

@@ -183,7 +183,7 @@ def broken_bag_on_error(topic: str | None = None) -> Iterator[None]:
     except DataError:  # a limit, which names the file
         raise
     except Exception as error:
-        raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
+        raise BagError(str(error).rstrip(".") or "it breaks off inside a record", topic) from None
 
 
 @contextmanager

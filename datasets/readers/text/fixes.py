@@ -1,24 +1,25 @@
 """Fixes in latitude and longitude -> the GNSS channel, with a note for everything assumed or left out."""
 
-import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimeRows, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import with_assumed_sigma
 from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.text.rows import RowTimes
 
 Datum = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Fixes:
+class Fixes(TimeRows):
     """Fixes as a receiver reports them.
 
     Attributes:
@@ -38,11 +39,6 @@ class Fixes:
     velocity_enu_mps: Array | None = None
     sigma_v_mps: Array | None = None
     local: bool = False
-
-    def select(self, rows: Any) -> "Fixes":
-        """The fixes of a boolean mask, slice or index array."""
-        arrays = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return dataclasses.replace(self, **arrays)
 
 
 def gnss_channel(
@@ -65,6 +61,28 @@ def gnss_channel(
     if velocity is None or not np.isfinite(velocity[:, :2]).any():
         velocity = sigma_v = None
     return Gnss(fixes.t_ns, enu, sigma, fixes.fix, velocity, sigma_v), datum, [*notes, *note]
+
+
+def gnss_recording(
+    request: Request, fixes: Fixes, datum: Datum | None, source: str, notes: Sequence[str], times: RowTimes
+) -> Recording:
+    """The recording of a log that holds nothing but fixes, with what `gnss_channel` notes behind `notes`.
+
+    Raises:
+        DataError: no row holds a fix.
+    """
+    gnss, datum, more = gnss_channel(request, fixes, datum)
+    if gnss is None:
+        raise DataError("holds no fix", remedy="record it under open sky, or process it again")
+    return Recording(
+        name=request.path.stem,
+        start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
+        gnss=gnss,
+        datum=datum,
+        source=source,
+        notes=(*notes, *more),
+        clock_jumps=times.jumps,
+    )
 
 
 def located(

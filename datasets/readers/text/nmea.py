@@ -25,7 +25,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import CLASS_SIGMA_M, UP_FACTOR
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import Fixes, gnss_recording
 from terrafusion.datasets.readers.text.rows import row_times
 
 CHECKED_SENTENCE = re.compile(
@@ -293,19 +293,8 @@ def read(request: Request) -> list[Recording]:
     times = row_times(request, "gnss", t_ns)
     fixes, more = _fixes(request, epochs, t_ns)
     fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
-    gnss, datum, rest = gnss_channel(request, fixes)
-    if gnss is None:
-        raise DataError("no sentence holds a fix", remedy="record it again under open sky")
-    recording = Recording(
-        name=path.stem,
-        start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
-        gnss=gnss,
-        datum=datum,
-        source="NMEA 0183 log",
-        notes=(*notes, *date_notes, *times.notes, *more, *rest),
-        clock_jumps=times.jumps,
-    )
-    return [recording]
+    notes += [*date_notes, *times.notes, *more]
+    return [gnss_recording(request, fixes, None, "NMEA 0183 log", notes, times)]
 
 
 def _column(epochs: list[Epoch], name: str) -> NDArray[Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.clock import repair, repair_together, sorting
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
@@ -31,7 +31,7 @@ MAX_T_NS = 4 * 10**18
 
 
 @dataclass(frozen=True, eq=False)
-class NumberRows:
+class NumberRows(TimeRows):
     """What a file holds.
 
     Attributes:
@@ -46,13 +46,6 @@ class NumberRows:
     values: Array
     lines: NDArray[np.int64]
     notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def select(self, rows: Mask | NDArray[np.intp]) -> "NumberRows":
-        """The rows of a mask or of indices."""
-        return NumberRows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
 
     def error(self, row: int, what: str, remedy: str) -> DataError:
         """An error at a row, with its line and the seconds since the first row."""
@@ -118,7 +111,7 @@ def put_in_time(
     times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
     notes, out = [], {}
     for name, rows in parts.items():
-        out[name] = NumberRows(rows.path, times[name], rows.values, rows.lines, rows.notes)
+        out[name] = dataclasses.replace(rows, t_ns=times[name])
         if (late := sorting(times[name], name)) is not None:
             out[name] = out[name].select(late[0])
             notes.append(late[1])

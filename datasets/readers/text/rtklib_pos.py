@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, TimesNs
-from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_from_ecef
@@ -28,7 +28,7 @@ from terrafusion.datasets.readers.delimited import (
     split,
 )
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_recording
 from terrafusion.datasets.readers.text.rows import RowTimes, row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
@@ -74,20 +74,9 @@ def read(request: Request) -> list[Recording]:
     notes += [*columns.notes, *times.notes]
     if b"/geodetic" in data[:4096] and header.kind != BASELINE:
         notes.append("gnss: heights are above the geoid; taken as they are")
-    solution = _Solution(request, columns, header, times)
-    gnss, datum, more = solution.channel()
-    if gnss is None:
-        raise DataError("no row holds a fix", remedy="process the observations again")
-    recording = Recording(
-        name=path.stem,
-        start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
-        gnss=gnss,
-        datum=datum,
-        source="RTKLIB solution",
-        notes=(*notes, *more),
-        clock_jumps=times.jumps,
-    )
-    return [recording]
+    solution = _Solution(columns, header, times)
+    fixes, base = solution.fixes(), solution.base()
+    return [gnss_recording(request, fixes, base, "RTKLIB solution", [*notes, *solution.notes], times)]
 
 
 def _is_row(head: bytes) -> bool:
@@ -185,24 +174,23 @@ def _calendar_ns(columns: TextTable) -> TimesNs:
 class _Solution:
     """The rows of a file, in the order of their times."""
 
-    def __init__(self, request: Request, columns: TextTable, header: PosHeader, times: RowTimes) -> None:
-        self.request, self.columns, self.header, self.times = request, columns, header, times
+    def __init__(self, columns: TextTable, header: PosHeader, times: RowTimes) -> None:
+        self.columns, self.header, self.times = columns, header, times
         self.notes: list[str] = []
         self.fix = self._fix()
 
     def stack(self, *names: str) -> Array:
         return self.columns.stack(names)[self.times.order]
 
-    def channel(self) -> tuple[Gnss | None, Datum | None, list[str]]:
-        """The fixes about the base station of a baseline, else about the first of them."""
-        local = self.header.kind == BASELINE
-        fixes = self._ecef() if self.header.kind == ECEF else self._along_axes(local)
-        gnss, datum, more = gnss_channel(self.request, fixes, self._base() if local else None)
-        return gnss, datum, [*self.notes, *more]
+    def fixes(self) -> Fixes:
+        """The fixes in latitude and longitude, or along the axes of a baseline."""
+        return self._ecef() if self.header.kind == ECEF else self._along_axes(self.header.kind == BASELINE)
 
-    def _base(self) -> Datum | None:
-        """Position of the base station, where the file has it."""
+    def base(self) -> Datum | None:
+        """Position of the base station of a baseline, where the file has it."""
         base = self.header.base
+        if self.header.kind != BASELINE:
+            return None
         if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
             return base[0], base[1], base[2]
         self.notes.append("gnss: baselines of a base station whose position is not in the file")
