@@ -178,12 +178,15 @@ def _velocities(scale: float = 1.0, *, swap: bool = False, signs: tuple[float, f
 
     def repaired(gnss: Gnss) -> Gnss:
         assert gnss.velocity_enu_mps is not None
-        velocity = gnss.velocity_enu_mps[:, [1, 0, 2]] if swap else gnss.velocity_enu_mps
-        velocity = velocity * (scale * signs[0], scale * signs[1], scale)
+        velocity = gnss.velocity_enu_mps[:, _order(swap)] * (scale * signs[0], scale * signs[1], scale)
         sigma = None if gnss.sigma_v_mps is None else gnss.sigma_v_mps * scale
         return dataclasses.replace(gnss, velocity_enu_mps=velocity, sigma_v_mps=sigma)
 
     return changed("gnss", repaired)
+
+
+def _order(swap: bool) -> list[int]:
+    return [1, 0, 2] if swap else [0, 1, 2]
 
 
 def reflection(recording: Recording) -> tuple[str, Repair]:
@@ -200,6 +203,5 @@ def reflection(recording: Recording) -> tuple[str, Repair]:
 
 
 def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float]) -> Gnss:
-    order = [1, 0, 2] if swap else [0, 1, 2]
-    enu, sigma = gnss.enu_m[:, order] * (*signs, 1.0), gnss.sigma_enu_m[:, order]
+    enu, sigma = gnss.enu_m[:, _order(swap)] * (*signs, 1.0), gnss.sigma_enu_m[:, _order(swap)]
     return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma)

@@ -176,19 +176,18 @@ def chord_speeds(t_ns: TimesNs, position_m: Array) -> Array:
 @once
 def yaw_angles(context: CheckContext) -> dict[str, Integral]:
     """Angle turned (rad; of the wheels metres, right minus left) by "gyro", "wheels", "truth", "command"."""
-    recording = context.recording
-    start, wheels, truth = recording.start_ns, recording.wheels, recording.truth
-    found = {"gyro": gyro_angle(recording)}
-    if wheels is not None and wheels.has_sides():
-        sides = wheels.side_speeds_mps(context.wheel_radius_m() or ANY_RADIUS_M)
-        found["wheels"] = integral(start, wheels.t_ns, sides[:, 1] - sides[:, 0])
+    start, truth = context.recording.start_ns, context.recording.truth
+    rates = yaw_rates(context.recording, context.wheel_radius_m() or ANY_RADIUS_M)
+    found = {
+        "gyro" if name == "imu" else name: integral(start, *signal)
+        for name, signal in rates.items()
+        if name != "truth"
+    }
     if truth is not None and truth.quaternion is not None:
         yaw = truth.yaw_rad()
         known = np.isfinite(yaw)
         if known.sum() > 1:
             found["truth"] = Integral(seconds(truth.t_ns[known], start), np.unwrap(yaw[known]))
-    if recording.command is not None:
-        found["command"] = integral(start, recording.command.t_ns, recording.command.yaw_rate_radps)
     return {name: angle for name, angle in found.items() if angle is not None}
 
 

@@ -17,9 +17,10 @@ from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, CsvTable, read_table
 from terrafusion.datasets.readers.formats import Request, logs_in
-from terrafusion.datasets.readers.log_meta import Meta, read_meta
+from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 
 META = "meta.yaml"
 CHANNELS = (*Recording.CHANNELS, "truth")
@@ -71,7 +72,7 @@ def _meta(folder: Path) -> Meta:
         if logs:
             remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
-    meta = read_meta(folder / META)
+    meta = parse_meta(read_yaml(folder / META), folder / META)
     vehicle = folder / expanded(meta.vehicle or "")
     if vehicle.suffix in (".yaml", ".yml") and vehicle.is_file():
         return dataclasses.replace(meta, vehicle=str(vehicle.resolve()))

@@ -17,7 +17,6 @@ from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, sh
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.scratch import UNFINISHED
 from terrafusion.datasets.core.sensors import DRIVES
-from terrafusion.datasets.core.yaml_file import read_yaml
 
 TRUTH_CHANNELS = ("position", "yaw", "orientation", "velocity")
 MAX_START_NS = 8 * 10**18
@@ -104,17 +103,12 @@ class Meta(MetaFile):
         return Overrides(**{key.name: getattr(self, key.name) for key in dataclasses.fields(Overrides)})
 
 
-def read_meta(path: Path) -> Meta:
-    """Read and check `meta.yaml`.
+def parse_meta(content: dict[str, Any], path: Path) -> Meta:
+    """Check the keys and values of `meta.yaml`, as read from the file `path`.
 
     Raises:
-        ConfigError: not YAML, missing key, wrong type, value out of range; names key and remedy.
+        ConfigError: missing key, wrong type, value out of range; names key and remedy.
     """
-    return parse_meta(read_yaml(path), path)
-
-
-def parse_meta(content: dict[str, Any], path: Path) -> Meta:
-    """Check the keys and values of `meta.yaml`; errors as in `read_meta`, about the file `path`."""
     given = {key: value for key, value in content.items() if value is not None}
     if given.keys() == {UNFINISHED}:
         raise ConfigError("the log was not written to its end", file=path, remedy="write it again")
