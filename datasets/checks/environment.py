@@ -6,7 +6,6 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, changed_field, scaled
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Barometer
 
 PRESSURE_PA = (30e3, 110e3)
 """Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""
@@ -28,23 +27,23 @@ HARD_IRON = 0.1
 def check_pressure(context: CheckContext) -> Iterator[Finding]:
     """Pressures must be those of the atmosphere, in pascal."""
     barometer = context.recording.barometer
-    known = (
-        barometer.pressure_pa[np.isfinite(barometer.pressure_pa)] if barometer is not None else np.empty(0)
-    )
+    pressure = np.empty(0) if barometer is None else barometer.pressure_pa
+    known = pressure[np.isfinite(pressure)]
     if not known.size:
         return
     size = float(np.median(known))
     yield from _range(
         "barometer", "pressure", size, PRESSURE_PA, PRESSURE_UNITS, "Pa", "name the unit of the pressures"
     )
-    beyond = (known < PRESSURE_PA[0]) | (known > PRESSURE_PA[1])
-    if PRESSURE_PA[0] <= size <= PRESSURE_PA[1] and beyond.any():
+    low, high = PRESSURE_PA
+    beyond = (known < low) | (known > high)
+    if low <= size <= high and beyond.any():
         yield Finding(
             "pressure-range", "warning", "barometer",
             f"{int(beyond.sum())} of {len(known)} pressures are outside the atmosphere's range",
             f"from {known.min():.6g} to {known.max():.6g} Pa",
             "leave these rows out",
-            changed("barometer", _within_range),
+            changed("barometer", lambda b: b.select((b.pressure_pa >= low) & (b.pressure_pa <= high))),
         )  # fmt: skip
 
 
@@ -88,11 +87,6 @@ def _range(
         f"multiply by {units[meant]:g}" if meant else fix,
         scaled(channel, units[meant], FIELDS[channel]) if meant else None,
     )  # fmt: skip
-
-
-def _within_range(barometer: Barometer) -> Barometer:
-    p = barometer.pressure_pa
-    return barometer.select((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1]))
 
 
 def _hard_iron(field: Array) -> Iterator[Finding]:

@@ -25,7 +25,7 @@ from terrafusion.datasets.checks.path import (
     scale_of,
 )
 from terrafusion.datasets.checks.signals import MEASURED
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.recording import Recording
@@ -302,7 +302,11 @@ def _held(contexts: Sequence[CheckContext]) -> dict[str, UpdateRate]:
     """Channels that hold their values, by the median over the recordings."""
     rates: dict[str, list[tuple[float, float]]] = {}
     for context in contexts:
-        for name, t_ns, values in _measured(context.recording):
+        for name, fields in MEASURED.items():
+            channel = getattr(context.recording, name)
+            if channel is None:
+                continue
+            t_ns, values = channel.t_ns, np.hstack([getattr(channel, field) for field in fields])
             span_s = float(t_ns[-1] - t_ns[0]) * 1e-9 if len(t_ns) > 1 else 0.0
             rows = held_rows(values)
             if span_s > 0.0 and rows > 1:
@@ -310,11 +314,3 @@ def _held(contexts: Sequence[CheckContext]) -> dict[str, UpdateRate]:
                 rates.setdefault(name, []).append(((len(t_ns) - 1) / span_s, (updates - 1) / span_s))
     found = {name: UpdateRate(*np.median(np.array(pairs), axis=0).tolist()) for name, pairs in rates.items()}
     return {name: one for name, one in found.items() if one.update_hz < HELD * one.rate_hz}
-
-
-def _measured(recording: Recording) -> Iterator[tuple[str, TimesNs, Array]]:
-    """Times and measured values by channel."""
-    for name, fields in MEASURED.items():
-        channel = getattr(recording, name)
-        if channel is not None:
-            yield name, channel.t_ns, np.hstack([getattr(channel, field) for field in fields])

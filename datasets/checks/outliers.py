@@ -159,7 +159,7 @@ def check_magnitude(context: CheckContext) -> Iterator[Finding]:
     for name, (t_ns, _) in tables.items():
         yield from _check_duration(context, name, t_ns)
     for name, (t_ns, columns) in tables.items():
-        limits = {column: LIMITS.get((name, _unit(column)), np.inf) for column in columns}
+        limits = {column: LIMITS.get((name, f"_{column.rpartition('_')[2]}"), np.inf) for column in columns}
         limited = {column: values for column, values in columns.items() if np.isfinite(limits[column])}
         beyond = {column: np.abs(values) > limits[column] for column, values in limited.items()}
         beyond = {column: mask for column, mask in beyond.items() if mask.any()}
@@ -201,7 +201,3 @@ def _tables(recording: Recording) -> dict[str, tuple[TimesNs, dict[str, NDArray[
         position = dict(zip(("x_m", "y_m", "z_m"), recording.truth.position_m.T, strict=True))
         tables["truth"] = recording.truth.t_ns, position
     return tables
-
-
-def _unit(column: str) -> str:
-    return column[column.rindex("_") :] if "_" in column else ""

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -18,6 +19,7 @@ from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs, distinct
 from terrafusion.datasets.core.channels import (
     Barometer,
+    Channel,
     Command,
     Fix,
     Gnss,
@@ -164,9 +166,8 @@ WHEEL_LAYOUTS: Layouts = (
 )
 """Layouts of wheels.csv: names and unit; the column is name_unit. name_rad may hold the angle."""
 
-GYRO = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps")
-ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
-FIELD = ("field_x_t", "field_y_t", "field_z_t")
+GYRO, ACCEL = Imu.COLUMNS.values()
+CURRENTS, VOLTAGES = Motor.COLUMNS.values()
 GNSS_POSITION = ("east_m", "north_m", "sigma_e_m", "sigma_n_m")
 GNSS_SIGMA = ("sigma_e_m", "sigma_n_m", "sigma_u_m")
 GNSS_HEIGHT = ("up_m", "sigma_u_m")
@@ -187,10 +188,11 @@ def wheel_columns(layouts: Layouts) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*speeds, *(f"{name}_rad" for names in turning for name in names)]))
 
 
-COMMAND, CURRENTS, VOLTAGES = ("v_mps", "yaw_rate_radps"), ("left_a", "right_a"), ("left_v", "right_v")
+PLAIN: dict[str, type[Channel]] = {kind.name: kind for kind in (Command, Barometer, Magnetometer)}
+"""Channels whose table holds all their columns, whatever else."""
 STEERING = tuple(dict.fromkeys(f"{name}_rad" for names in Steering.LAYOUTS for name in names))
-COLUMNS = {
-    "command": ChannelColumns(COMMAND, required=COMMAND),
+_WHOLE = {name: tuple(chain.from_iterable(kind.COLUMNS.values())) for name, kind in PLAIN.items()}
+COLUMNS = {name: ChannelColumns(columns, required=columns) for name, columns in _WHOLE.items()} | {
     "wheels": ChannelColumns(wheel_columns(WHEEL_LAYOUTS)),
     "imu": ChannelColumns((*GYRO, *ACCEL)),
     "gnss": ChannelColumns(
@@ -198,8 +200,6 @@ COLUMNS = {
     ),
     "motor": ChannelColumns((*CURRENTS, *VOLTAGES), required=CURRENTS),
     "terrain": ChannelColumns((), ("label",), ("p_",), required=("label",)),
-    "barometer": ChannelColumns(("pressure_pa",), required=("pressure_pa",)),
-    "magnetometer": ChannelColumns(FIELD, required=FIELD),
     "steering": ChannelColumns(STEERING),
     "truth": ChannelColumns(
         ("x_m", "y_m", "z_m", *QUATERNION, *TRUTH_TWIST, *COVARIANCE), required=("x_m", "y_m")
@@ -233,10 +233,11 @@ class ChannelReader:
     def channel(self, name: str) -> Any:
         """The channel, or the truth; None where there is no table, or none of its rows holds a value."""
         table = self._table(name)
-        return None if table is None else getattr(self, f"_{name}")(table)
-
-    def _command(self, table: CsvTable) -> Command:
-        return Command(self._t(table), *(table.numbers[name] for name in COMMAND))
+        if table is None or name not in PLAIN:
+            return None if table is None else getattr(self, f"_{name}")(table)
+        parts = PLAIN[name].COLUMNS.values()
+        fields = (table.numbers[names[0]] if len(names) == 1 else table.stack(names) for names in parts)
+        return PLAIN[name](self._t(table), *fields)
 
     def _wheels(self, table: CsvTable) -> Wheels:
         alone = [names for names, _ in self.layouts if {f"{n}_rad" for n in names} == {*table.numbers}]
@@ -361,12 +362,6 @@ class ChannelReader:
                 return Steering(self._t(table), table.stack(layout), names)
         what = f"columns {', '.join(table.numbers) or '(none)'} are not a layout"
         raise DataError(what, remedy=f"give one of: {' | '.join(map(', '.join, layouts))}")
-
-    def _barometer(self, table: CsvTable) -> Barometer:
-        return Barometer(self._t(table), table.numbers["pressure_pa"])
-
-    def _magnetometer(self, table: CsvTable) -> Magnetometer:
-        return Magnetometer(self._t(table), table.stack(FIELD))
 
     def _truth(self, table: CsvTable) -> Trajectory:
         quaternion = self._quaternion(table)

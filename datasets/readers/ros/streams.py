@@ -94,9 +94,9 @@ class Stream:
         """
         if not self.has(path):
             raise BagError(f"its messages have no '{path}', as {self.msgtype} should", self.topic)
-        if self._in_one_block:
-            return self.blocks[0].columns[path]
         first = self.blocks[0].columns[path]
+        if self._in_one_block:
+            return first
         out = np.empty((len(self), *first.shape[1:]), dtype=first.dtype)
         for block in self.blocks:
             out[block.rows] = block.columns[path]
