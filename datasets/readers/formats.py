@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,31 +51,33 @@ class Format:
     description: str
     module: str
 
+    @property
+    def _reader(self) -> Any:
+        return import_module(self.module)
+
     def claims(self, path: Path, head: bytes) -> bool:
         """Whether the file is of this format, by its name and first bytes (none for a folder)."""
-        return bool(import_module(self.module).claims(path, head))
+        return bool(self._reader.claims(path, head))
 
     def read(self, request: Request) -> Sequence[Recording]:
         """The recordings in the file."""
         # Huge numbers are a finding, not a warning.
         with errors_of(request.path), np.errstate(over="ignore", invalid="ignore"):
-            recordings: Sequence[Recording] = import_module(self.module).read(request)
+            recordings: Sequence[Recording] = self._reader.read(request)
         return recordings
 
     def member(self, path: Path) -> Path | None:
         """A file that the catalogue may know the log by: itself, or one in its folder."""
         if path.is_file():
             return path
-        module = import_module(self.module)
-        found: Path | None = module.member(path) if hasattr(module, "member") else None
+        found: Path | None = self._reader.member(path) if hasattr(self._reader, "member") else None
         return found
 
     def files(self, path: Path) -> list[Path]:
         """What `read` opens: all files of a folder; else the file and its companions."""
         if path.is_dir():
             return sorted(file for file in path.rglob("*") if file.is_file())
-        module = import_module(self.module)
-        others: Sequence[Path] = module.companions(path) if hasattr(module, "companions") else ()
+        others = self._reader.companions(path) if hasattr(self._reader, "companions") else ()
         columns = path.with_name(path.name + MAP_SUFFIX)
         return sorted({path, *others, *([columns] if columns.is_file() else [])})
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, Mask, TimesNs, distinct
+from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -166,32 +166,25 @@ def _gnss(
     if not rows.any():
         return None, None, ["gnss: no row holds a position; the channel is absent"]
     notes = ["gnss: the position is the device's own, fused with its IMU: errors of near fixes go together"]
-    fix, fix_notes = _fix(columns, rows)
+    fix, fix_notes = _fix(columns)
     velocity, more = _velocity(columns, settings)
-    fixes = Fixes(
-        t_ns[rows],
-        llh[rows],
-        fix,
-        np.full((int(rows.sum()), 3), np.nan),
-        None if velocity is None else velocity[rows],
-    )
+    fixes = Fixes(t_ns, llh, fix, np.full(llh.shape, np.nan), velocity).select(rows)
     gnss, datum, rest = gnss_channel(request, fixes)
     return gnss, datum, [*notes, *fix_notes, *more, *rest]
 
 
-def _fix(columns: TextTable, rows: Mask) -> tuple[NDArray[np.uint8], list[str]]:
+def _fix(columns: TextTable) -> tuple[NDArray[np.uint8], list[str]]:
     name = next((name for name in STATUS if name in columns.texts), None)
     if name is None:
-        return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [
-            "gnss: the export has no StatusWord; all fixes are taken as 'single'"
-        ]
+        note = "gnss: the export has no StatusWord; all fixes are taken as 'single'"
+        return np.full(len(columns), Fix.SINGLE, dtype=np.uint8), [note]
     words, inverse = distinct(columns.texts[name])
     codes = np.array([_class_of(status) for status in _status_words(name, words)], dtype=np.uint8)
     fix = codes[inverse]
     if "" in words:  # the status may come at a lower rate than the position
         last = np.maximum.accumulate(np.where(inverse != words.index(""), np.arange(len(fix)), 0))
         fix = fix[last]
-    return fix[rows], []
+    return fix, []
 
 
 def _status_words(name: str, words: list[str]) -> list[int]:
