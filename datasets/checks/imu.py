@@ -28,7 +28,7 @@ from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.bootstrap import interval_of, resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, turned_by
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import AXES, axes_matrix
 
@@ -81,14 +81,6 @@ def _mounting(context: CheckContext) -> Array:
 
     angles = [context.known(f"imu_{name}_rad") for name in ("roll", "pitch", "yaw")]
     return np.asarray(Rotation.from_euler("xyz", angles).as_matrix())
-
-
-def _rotated(R: Array, vectors: Array) -> Array:
-    """R @ v of vectors (N, 3); a NaN axis affects only the axes that R turns it into."""
-    unknown = np.isnan(vectors)
-    turned = np.where(unknown, 0.0, vectors) @ R.T
-    turned[unknown @ (R != 0.0).T] = np.nan
-    return np.asarray(turned)
 
 
 def is_metric(mean: Array) -> bool:
@@ -274,7 +266,7 @@ def heading(context: CheckContext) -> ForceHeading | None:
     if imu is None or not is_upright(context):
         return None
     R = _mounting(context)
-    return heading_of(context, _rotated(R, imu.accel_mps2)[:, :2], _rotated(R, imu.gyro_radps)[:, 2])
+    return heading_of(context, turned_by(R, imu.accel_mps2)[:, :2], turned_by(R, imu.gyro_radps)[:, 2])
 
 
 def turning_axis(context: CheckContext) -> str | None:
@@ -360,11 +352,9 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
 
 def _turned_by(imu: Imu, angle: float) -> Imu:
     """The readings in body axes of an IMU that is turned by `angle` (rad) about z, to the left."""
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    gyro, accel = imu.gyro_radps.copy(), imu.accel_mps2.copy()
-    for values in (gyro, accel):
-        values[:, :2] = values[:, :2] @ turn.T
-    return Imu(imu.t_ns, gyro, accel)
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Imu(imu.t_ns, turned_by(R, imu.gyro_radps), turned_by(R, imu.accel_mps2))
 
 
 def _pointing(sensor: str, axes: Axes) -> str:

@@ -1,7 +1,7 @@
-"""Exact, vectorised conversion of decimal and ISO 8601 times to integer nanoseconds."""
+"""Exact conversion of decimal and ISO 8601 times to integer nanoseconds."""
 
 from collections.abc import Sequence
-from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+from decimal import ROUND_HALF_EVEN, Decimal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,22 @@ def to_ns(texts: Sequence[str], unit: str = "s") -> NDArray[np.int64]:
     Raises:
         NotADecimal: a text is no finite decimal number, or beyond int64.
     """
-    cells = [text.strip() for text in texts]
-    width = max(map(len, cells), default=0)
-    if width > MAX_CHARACTERS:
-        raise NotADecimal(next(i for i, cell in enumerate(cells) if len(cell) == width))
+    return np.array([_one_to_ns(text, NS_PER[unit], row) for row, text in enumerate(texts)], dtype=np.int64)
+
+
+def _one_to_ns(text: str, ns: int, row: int) -> int:
+    if len(text) > MAX_CHARACTERS or "_" in text or not text.isascii():
+        raise NotADecimal(row)
     try:
-        padded = np.array(cells, dtype=f"S{width or 1}").view(np.uint8).reshape(len(cells), width or 1)
-    except UnicodeEncodeError:
-        raise NotADecimal(next(i for i, cell in enumerate(cells) if not cell.isascii())) from None
-    value, plain = _plain_to_ns(np.ascontiguousarray(padded.T), len(str(NS_PER[unit])) - 1)
-    for i in np.flatnonzero(~plain).tolist():
-        value[i] = _one_to_ns(cells[i], NS_PER[unit], i)
-    return value
+        number = Decimal(text)
+        if not number.is_finite() or number.adjusted() > 20:
+            raise NotADecimal(row)
+        whole = int((number * ns).to_integral_value(rounding=ROUND_HALF_EVEN))
+    except ArithmeticError:
+        raise NotADecimal(row) from None
+    if abs(whole) > _LIMIT_NS:
+        raise NotADecimal(row)
+    return whole
 
 
 def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
@@ -61,41 +65,3 @@ def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
     if bad.size:
         raise NotADecimal(int(bad[0]))
     return np.asarray(stamps.dt.as_unit("ns").astype("int64").to_numpy())
-
-
-def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Nanoseconds of texts like -12.345, given as (width, N) characters, and which texts have that form."""
-    n = characters.shape[1]
-    value, digits, decimals = (np.zeros(n, dtype=np.int64) for _ in range(3))
-    seen_dot, ended, plain = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.ones(n, dtype=bool)
-    negative = characters[0] == ord("-")
-    for k, c in enumerate(characters):
-        digit, dot, end = (c >= 48) & (c <= 57), c == ord("."), c == 0
-        sign = negative | (c == ord("+")) if k == 0 else np.zeros(n, dtype=bool)
-        plain &= (digit | (dot & ~seen_dot) | end | sign) & (end | ~ended)
-        value = np.where(digit, value * 10 + (c.astype(np.int64) - 48), value)
-        digits += digit
-        decimals += digit & seen_dot
-        seen_dot |= dot
-        ended |= end
-    size = digits - decimals + places  # digits of the nanoseconds; int64 holds 19 beginning with 8 or less
-    signed = negative | (characters[0] == ord("+"))
-    first = np.where(signed, characters[min(1, len(characters) - 1)], characters[0])
-    plain &= (digits > 0) & (decimals <= places) & ((size <= 18) | ((size == 19) & (first <= ord("8"))))
-    shift = np.where(plain, places - decimals, 0)
-    value = np.where(plain, value, 0) * 10**shift
-    return np.where(negative, -value, value), plain
-
-
-def _one_to_ns(cell: str, ns: int, row: int) -> int:
-    """Any other decimal notation: exponents, more decimals than nanoseconds."""
-    try:
-        number = Decimal(cell)
-        if "_" in cell or not number.is_finite() or number.adjusted() > 20:
-            raise NotADecimal(row)
-        whole = int((number * ns).to_integral_value(rounding=ROUND_HALF_EVEN))
-    except (InvalidOperation, ArithmeticError):
-        raise NotADecimal(row) from None
-    if abs(whole) > _LIMIT_NS:
-        raise NotADecimal(row)
-    return whole

@@ -62,6 +62,15 @@ def rpy_to_quaternion(rpy_rad: ArrayLike) -> Array:
     )
 
 
+def turned_by(R: Array, values: Array) -> Array:
+    """R @ v of vectors (N, 3), with the same bits for any N; an axis is NaN only where it depends on one."""
+    missing = np.isnan(values)
+    known = np.where(missing, 0.0, values)
+    out = sum((known[:, i, None] * R[:, i] for i in range(3)), np.zeros_like(known))
+    out[missing.astype(float) @ (np.abs(R) > 0.0).T > 0.0] = np.nan
+    return np.asarray(out)
+
+
 def yaw_of(q_xyzw: ArrayLike) -> Array:
     """Yaw angles (...), rad, of quaternions (..., 4)."""
     x, y, z, w = np.moveaxis(np.asarray(q_xyzw, dtype=float), -1, 0)

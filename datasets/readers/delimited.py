@@ -35,8 +35,6 @@ MISSING = ("", "NaN", "nan", "NAN", "-nan")
 TRUTH_WORDS = (b"rue", b"RUE", b"alse", b"ALSE")
 """In words that pandas takes for 1 and 0."""
 
-_CHUNK = 2**24
-
 
 @dataclass(frozen=True)
 class TextLayout:
@@ -247,8 +245,10 @@ def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tup
 def _check_counts(data: bytes, layout: TextLayout) -> None:
     """Refuse the first line that has not as many cells as there are columns."""
     quoted = layout.separator != BLANKS and b'"' in data
-    for line, text, count in _quoted_misfits(data, layout) if quoted else _misfits(data, layout):
-        if line < layout.first_line or not text.strip() or (layout.comment and text[0] == layout.comment):
+    for line, text, count in _quoted_counts(data, layout) if quoted else _counts(data, layout):
+        if count == len(layout.names) or line < layout.first_line or not text.strip():
+            continue
+        if layout.comment and text[0] == layout.comment:
             continue
         what = f"line {line} has {count} cells for {len(layout.names)} columns"
         cells, remedy = split(text, layout.separator), "is it cut off, or of another table?"
@@ -266,37 +266,18 @@ def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str]
     return DataError(what, time_s=since_s, remedy=remedy)
 
 
-def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    """Line number, beginning and cells of lines with another number of cells than columns."""
-    blanks = np.zeros(256, dtype=bool)
-    blanks[[9, 10, 13, 32]] = True
-    begin, line = 0, 1
-    while begin < len(data):
-        end = len(data) if len(data) - begin <= _CHUNK else data.rfind(b"\n", begin, begin + _CHUNK) + 1
-        end = end or data.find(b"\n", begin) + 1 or len(data)  # a line longer than the chunk
-        chunk = np.frombuffer(data, np.uint8, end - begin, begin)
-        ends = np.flatnonzero(chunk == 10)
-        if not ends.size or ends[-1] != len(chunk) - 1:
-            ends = np.append(ends, len(chunk))
-        if layout.separator == BLANKS:
-            inside = ~blanks[chunk]
-            marks = np.flatnonzero(inside & np.concatenate([[True], ~inside[:-1]]))
-            extra = 0
-        else:
-            marks = np.flatnonzero(chunk == ord(layout.separator))
-            extra = 1
-        counts = np.diff(np.searchsorted(marks, ends), prepend=0) + extra
-        for i in np.flatnonzero(counts != len(layout.names)).tolist():
-            start = begin + (int(ends[i - 1]) + 1 if i else 0)
-            text = data[start : min(begin + int(ends[i]), start + 500)].decode("utf-8", "replace")
-            yield line + i, text, int(counts[i])
-        begin, line = end, line + len(ends)
+def _counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
+    """Number, beginning and cells of each line."""
+    mark, width = layout.separator.encode(), len(layout.names)
+    for number, line in enumerate(io.BytesIO(data), 1):
+        count = len(line.split()) if layout.separator == BLANKS else line.count(mark) + 1
+        if count != width:
+            yield number, line[:500].decode("utf-8", "replace").rstrip("\n"), count
 
 
-def _quoted_misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    for line, cells in _rows(data, layout):
-        if len(cells) != len(layout.names):
-            yield line, layout.separator.join(cells) or ".", len(cells)
+def _quoted_counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
+    for number, cells in _rows(data, layout):
+        yield number, layout.separator.join(cells) or ".", len(cells)
 
 
 def _parse(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import errors_of
+from terrafusion.datasets.core.frames import turned_by
 from terrafusion.datasets.core.messages import Message, WheelSample
 from terrafusion.datasets.core.wrapped_angles import TurnCounter
 from terrafusion.datasets.readers.formats import Request
@@ -24,7 +25,6 @@ from terrafusion.datasets.readers.ros.channels import ChannelBuilder, Datum
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch, batches_of
-from terrafusion.datasets.readers.ros.static_frames import turned_by
 from terrafusion.datasets.readers.ros.streams import Stream, broken_bag_on_error, types_of, wanted_fields
 from terrafusion.datasets.readers.ros.topics import joints_given
 

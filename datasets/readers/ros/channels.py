@@ -20,6 +20,7 @@ from terrafusion.datasets.core.channels import (
 )
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permuted
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import turned_by
 from terrafusion.datasets.core.sensors import Rig, with_assumed_sigma
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
@@ -37,7 +38,6 @@ from terrafusion.datasets.readers.ros.static_frames import (
     StaticFrames,
     mounting_note,
     tells_turn,
-    turned_by,
 )
 from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import Fixes, located

@@ -97,14 +97,5 @@ def antenna_is_known(rig: Rig | None) -> bool:
     return antenna is not None and antenna.known in ("measured", "calibrated")
 
 
-def turned_by(R: Array, values: Array) -> Array:
-    """R @ v of vectors (N, 3), with the same bits for any N; an axis is NaN only where it depends on one."""
-    missing = np.isnan(values)
-    known = np.where(missing, 0.0, values)
-    out = sum((known[:, i, None] * R[:, i] for i in range(3)), np.zeros_like(known))
-    out[missing.astype(float) @ (np.abs(R) > 0.0).T > 0.0] = np.nan
-    return np.asarray(out)
-
-
 def _plain(frame: str) -> str:
     return frame.lstrip("/")

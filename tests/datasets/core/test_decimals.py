@@ -1,4 +1,4 @@
-"""Decimal times to nanoseconds: the vectorised conversion equals that of `decimal`."""
+"""Decimal times to nanoseconds: none passes through a float."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core import decimals
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, to_ns
 
 NUMBERS = st.from_regex(r"\A[+-]?\d{1,12}(\.\d{0,14})?\Z") | st.from_regex(r"\A-?\d\.\d{0,9}[eE][+-]?\d\Z")
@@ -41,17 +40,6 @@ def test_what_is_no_time(text: str) -> None:
     with pytest.raises(NotADecimal) as error:
         to_ns(["1.5", text])
     assert error.value.row == 1
-
-
-def test_plain_times_use_the_fast_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unix times as loggers write them never go one by one."""
-    monkeypatch.setattr(decimals, "_one_to_ns", None)
-    for text, unit in (
-        ("1700000000.123456789", "s"),
-        ("1700000000123.5", "ms"),
-        ("1700000000123456789", "ns"),
-    ):
-        assert to_ns([text, f"-{text}"], unit).tolist()[0] // 10**9 == 1_700_000_000
 
 
 def test_no_times() -> None:

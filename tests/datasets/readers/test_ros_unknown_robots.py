@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import turned_by
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.ros.static_frames import turned_by
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.datasets.ros_bags import MAKE2, T0, Message, imu_messages, write_ros2
