@@ -7,6 +7,7 @@ then read by one structured dtype, bit for bit.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -197,7 +198,6 @@ class MessageDecoder:
     _layouts: dict[int, list[MessageLayout]] = field(default_factory=dict)
     _pieces: dict[Any, list[MessageBlock]] = field(default_factory=dict)
     _receipts: list[NDArray[np.int64]] = field(default_factory=list)
-    _known_words: dict[bytes, str] = field(default_factory=dict)
 
     def add(self, batch: MessageBatch) -> None:
         """Take in messages.
@@ -249,31 +249,11 @@ class MessageDecoder:
             column = records[name]
             columns[name] = column.astype(column.dtype.newbyteorder("="), order="C")
         for path, (places, listed) in layout.words.items():
-            words = [self._words(raw[:, at : at + size]) for at, size in places]
+            words = [_texts(raw[:, at : at + size]) for at, size in places]
             none = np.empty((len(raw), 0), dtype=object)
             columns[path] = (np.stack(words, axis=1) if words else none) if listed else words[0]
         shape = tuple((path, column.dtype, column.shape[1:]) for path, column in columns.items())
         self._pieces.setdefault(shape, []).append(MessageBlock(rows, columns))
-
-    def _words(self, raw: Bytes) -> NDArray[Any]:
-        """Strings (n,) of their bytes (n, size)."""
-        out = np.empty(len(raw), dtype=object)
-        if not raw.shape[1] or (raw == raw[0]).all():
-            out[:] = self._word(raw[0].tobytes())
-            return out
-        packed = np.ascontiguousarray(raw).view(f"V{raw.shape[1]}")[:, 0]
-        out[:] = [self._word(word) for word in packed.tolist()]
-        return out
-
-    def _word(self, word: bytes) -> str:
-        if word not in self._known_words:
-            if len(self._known_words) > 10_000:
-                self._known_words.clear()
-            try:
-                self._known_words[word] = word.decode()
-            except UnicodeDecodeError:
-                raise BagError("a string is not valid UTF-8") from None
-        return self._known_words[word]
 
     def result(self) -> tuple[NDArray[np.int64], tuple[MessageBlock, ...]]:
         """Receipt times (N,) of all messages, and blocks that together hold them; empties the decoder."""
@@ -282,6 +262,25 @@ class MessageDecoder:
         self._receipts.clear()
         self.count = 0
         return receipt_ns, blocks
+
+
+def _texts(raw: Bytes) -> NDArray[Any]:
+    """Strings (n,) of their bytes (n, size)."""
+    out = np.empty(len(raw), dtype=object)
+    if not raw.shape[1] or (raw == raw[0]).all():
+        out[:] = _text(raw[0].tobytes())
+    else:
+        packed = np.ascontiguousarray(raw).view(f"V{raw.shape[1]}")[:, 0]
+        out[:] = [_text(word) for word in packed.tolist()]
+    return out
+
+
+@lru_cache(maxsize=10_000)
+def _text(word: bytes) -> str:
+    try:
+        return word.decode()
+    except UnicodeDecodeError:
+        raise BagError("a string is not valid UTF-8") from None
 
 
 def _joined(pieces: list[MessageBlock]) -> MessageBlock:

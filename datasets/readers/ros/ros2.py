@@ -2,7 +2,7 @@
 
 import dataclasses
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -40,14 +40,11 @@ USED = {"topics", "messages", "message_definitions"}
 class Db3File:
     """An open SQLite database of a ROS 2 bag.
 
-    Args:
-        counts: numbers of messages by topic where they are known; counting them takes a pass over the file.
-
     Raises:
         BagError: the file is cut off, or not such a database.
     """
 
-    def __init__(self, path: Path, counts: Mapping[str, int] | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         _refuse_cut(path)
         self._bytes, self._steps = path.stat().st_size, 0
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
@@ -55,7 +52,7 @@ class Db3File:
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MESSAGE_BYTES)
         self._database.set_progress_handler(self._is_endless, STEPS_AT_A_TIME)
         try:
-            self.sources: list[BagSource] = self._sources(counts)
+            self.sources: list[BagSource] = self._sources()
         except BaseException:
             self.close()
             raise
@@ -81,13 +78,11 @@ class Db3File:
                 raise BagError(f"its table {name} is computed, not stored")
         return set(tables)
 
-    def _sources(self, known_counts: Mapping[str, int] | None) -> list[BagSource]:
+    def _sources(self) -> list[BagSource]:
         run, tables = self._run, self._check_tables()
         if not {"topics", "messages"} <= tables:
             raise BagError("the database has no tables of topics and messages")
-        counts: dict[int, int] = {}
-        if known_counts is None:
-            counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+        counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -96,7 +91,7 @@ class Db3File:
         for number, topic, name, encoding in run("SELECT id, name, type, serialization_format FROM topics"):
             language, text = definitions.get(name, ("", ""))
             known = LANGUAGES.get(language, "msg")
-            count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
+            count = int(counts.get(number, 0))
             if len(sources) >= limits.TOPICS:
                 raise limits.too_much("topics", limits.TOPICS)
             sources.append(
@@ -188,8 +183,7 @@ class Ros2Folder:
                 if not path.is_file():
                     raise BagError(f"the file {path.name} is missing")
                 path = self._unpacked(path) if mode == "file" else path
-                alone = storage is Db3File and len(names) == 1
-                self._add(Db3File(path, _counts(metadata)) if alone else storage(path))
+                self._add(storage(path))
         except BaseException:
             self.close()
             raise
@@ -238,16 +232,6 @@ def _messages(batch: MessageBatch) -> Iterator[bytes]:
         if whole is None or whole > limits.MESSAGE_BYTES:
             raise BagError(f"a message claims {whole or 'an unknown number of'} bytes")
         yield decompress(packed, "zstd", whole)
-
-
-def _counts(metadata: dict[str, Any]) -> dict[str, int] | None:
-    """Numbers of messages by topic, by metadata.yaml; None where a topic has none."""
-    try:
-        topics = metadata["topics_with_message_count"]
-        found = {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
-        return found if found and all(count > 0 for count in found.values()) else None
-    except (KeyError, TypeError, ValueError):
-        return None
 
 
 def _metadata(path: Path) -> dict[str, Any]:
