@@ -18,8 +18,6 @@ TEXT_BYTES = 2**29
 LINE_BYTES = 2**16
 ROWS, COLUMNS, VALUES = 5_000_000, 2_000, 2**25
 """Of a table; `VALUES` are rows times columns."""
-NUMBER_ROWS = 1_000_000
-"""Of a file of numbers without a header: 83 minutes at 200 Hz."""
 EXPANSION, FREE_BYTES = 200, 2**24
 """A packed file may unpack to `FREE_BYTES` plus so many times its own size; text compresses 5 to 20 times."""
 

@@ -225,7 +225,8 @@ def read_columns(
         texts={n: table[n] for n in texts},
     )
     if not len(columns) and not layout.strict:
-        raise DataError("holds a header but no rows", remedy="record or copy it again")
+        what = "holds a header but no rows" if layout.first_line > 1 else "holds no rows"
+        raise DataError(what, remedy="record or copy it again")
     return columns
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.clock import repair, repair_together, sorting
 from terrafusion.datasets.core.errors import DataError, errors_of
@@ -37,7 +36,7 @@ class NumberRows(TimeRows):
     Attributes:
         t_ns: (N,) int64, as written, in the order of the lines.
         values: (N, k) of the other columns, all finite.
-        lines: (N,) line numbers where no line is blank.
+        lines: (N,) line numbers where no line is blank or a comment.
         notes: what was odd about the file, in sentences.
     """
 
@@ -54,13 +53,14 @@ class NumberRows(TimeRows):
 
 
 def read_rows(
-    path: Path, columns: Sequence[str], *, separator: str = BLANKS, header: bool = False
+    path: Path, columns: Sequence[str], *, separator: str = BLANKS, header: bool = False, comment: str = ""
 ) -> NumberRows:
     """Read a file whose first column is time in seconds.
 
     Args:
         columns: names of all its columns, the time first.
         header: whether the first line names the columns, in any order.
+        comment: character that begins lines without a row; "" for none.
 
     Raises:
         DataError: unreadable, too large, no rows, a wrong header, a line that has too few or too
@@ -68,20 +68,15 @@ def read_rows(
             its time. Times are not checked for order: `put_in_time` does that.
     """
     with errors_of(path):
-        return _read(path, columns, separator, header)
+        return _read(path, columns, separator, header, comment)
 
 
-def _read(path: Path, columns: Sequence[str], separator: str, header: bool) -> NumberRows:
+def _read(path: Path, columns: Sequence[str], separator: str, header: bool, comment: str) -> NumberRows:
     data = read_text(path)
-    if data.count(b"\n") > limits.NUMBER_ROWS:
-        raise limits.too_much("lines", limits.NUMBER_ROWS, "split it into shorter recordings")
     names = _header(data, columns, separator) if header else tuple(columns)
-    layout = TextLayout(names, separator, first_line=2 if header else 1, time=columns[0])
+    layout = TextLayout(names, separator, 2 if header else 1, comment, columns[0])
     table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
     t_ns = table.times_ns(columns[0])
-    far = np.flatnonzero(np.abs(t_ns) > MAX_T_NS)
-    if far.size:
-        raise table.bad_cell(columns[0], int(far[0]), "give a time in seconds")
     values = table.stack(columns[1:])
     missing = np.argwhere(np.isnan(values))
     if missing.size:
@@ -100,6 +95,11 @@ def put_in_time(
     Raises:
         DataError: a time runs backwards, and `repair_clock` is not asked for.
     """
+    for rows in parts.values():
+        far = np.flatnonzero(np.abs(rows.t_ns) > MAX_T_NS)
+        if far.size:
+            what = f"the time is {rows.t_ns[far[0]] * 1e-9:.9g} s"
+            raise rows.error(int(far[0]), what, "give a time in seconds")
     if not repair_clock:
         for name, rows in parts.items():
             back = np.flatnonzero(np.diff(rows.t_ns) < 0)

@@ -3,18 +3,17 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.delimited import BLANKS, TextLayout, head_lines, read_columns, read_text
-from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.delimited import BLANKS, head_lines
+from terrafusion.datasets.readers.formats import HEAD_BYTES, Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.rows import row_times
+from terrafusion.datasets.readers.text.rows import read_rows, row_times
 
-COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 NORM_TOLERANCE = 0.01
 
 
@@ -37,9 +36,12 @@ def claims(path: Path, head: bytes) -> bool:
 
 def read(request: Request) -> list[Recording]:
     """The one recording of a trajectory: nothing but truth."""
-    t_ns, table, notes = tum_rows(request.path)
-    times = row_times(request, "truth", t_ns)
-    table = table[times.order]
+    with request.path.open("rb") as file:
+        lines = [line for _, line in head_lines(file.read(HEAD_BYTES)) if line.strip() and line[0] != "#"]
+    separator = "," if lines and "," in lines[0] else BLANKS
+    rows = read_rows(request.path, COLUMNS, separator=separator, comment="#")
+    times, notes = row_times(request, "truth", rows.t_ns), rows.notes
+    table = rows.values[times.order]
     _check_norms(table[:, 3:])
     fresh = np.concatenate([[True], np.diff(times.t_ns) > 0])
     if not fresh.all():
@@ -60,26 +62,6 @@ def read(request: Request) -> list[Recording]:
         clock_jumps=times.jumps,
     )
     return [recording]
-
-
-def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
-    """Times (N,) int64 ns, positions and quaternions (N, 7) as the file has them, and notes.
-
-    Raises:
-        DataError: unreadable, no poses, or a line that is not eight finite numbers.
-    """
-    data = read_text(path)
-    first = next((line for _, line in head_lines(data) if line.strip() and line.strip()[0] != "#"), "")
-    if not first:
-        raise DataError("no poses", remedy="a line is: t x y z qx qy qz qw")
-    layout = TextLayout(("t", *COLUMNS), "," if "," in first else BLANKS, 1, "#")
-    columns = read_columns(path, data, layout, COLUMNS, ["t"])
-    table = columns.stack(COLUMNS)
-    unknown = np.flatnonzero(np.isnan(table).any(axis=1))
-    if unknown.size:
-        name = COLUMNS[int(np.argmax(np.isnan(table[unknown[0]])))]
-        raise columns.bad_cell(name, int(unknown[0]), "a line is: t x y z qx qy qz qw")
-    return columns.times_ns("t"), table, columns.notes
 
 
 def _check_norms(quaternion: Array) -> None:

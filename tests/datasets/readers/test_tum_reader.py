@@ -89,7 +89,7 @@ def test_backward_times(tmp_path: Path) -> None:
 
 
 BAD = {
-    "no poses": ("# nothing\n", "no poses"),
+    "no poses": ("# nothing\n", "holds no rows"),
     "text": (f"0 {POSE}\n1 1 2 three 0 0 0 1\n", "column 'z' is 'three' at line 2"),
     "NaN": (f"0 {POSE}\n1 1 2 nan 0 0 0 1\n", "column 'z' is 'nan' at line 2"),
     "infinite": (f"0 {POSE}\n1 1 2 inf 0 0 0 1\n", "column 'z' is 'inf' at line 2"),

@@ -206,7 +206,7 @@ def test_other_text_is_not_claimed(tmp_path: Path) -> None:
 
 
 def test_a_file_of_too_many_lines_is_refused(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NUMBER_ROWS", 2999)
+    monkeypatch.setattr(limits, "ROWS", 2999)
     with pytest.raises(DataError, match=r"trial4_wheel_imu\.txt: has more than 2 999 lines"):
         open_recording(trial / FAMILY[0])
 
