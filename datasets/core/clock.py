@@ -5,7 +5,10 @@ all later times so that the interval at the step is the nominal one; the repaire
 than a sampling period. Messages that arrived out of order have correct times; `in_order` sorts them.
 """
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +31,6 @@ SHARED_ROWS = 3
 LEAP_PERIODS, LEAP_S = 10, 0.5
 """An interval longer than both is a jump ahead, where those are removed."""
 MAX_STEPS = 1000
-
-
-def repair(t_ns: TimesNs, channel: str) -> tuple[TimesNs, tuple[ClockJump, ...]]:
-    """Remove the clock steps of one channel: repaired times (N,), and the steps; see `repair_together`."""
-    fixed, jumps = repair_together({channel: np.asarray(t_ns)})
-    return fixed[channel], jumps
 
 
 def repair_together(
@@ -73,6 +70,36 @@ def repair_together(
     return fixed, tuple(
         ClockJump(name, int(fixed[name][row]), -lack / 1e9) for name in times for row, lack in steps[name]
     )
+
+
+@dataclass(frozen=True, eq=False)
+class RowTimes:
+    """Times that never decrease.
+
+    Attributes:
+        t_ns: (N,) int64.
+        order: rows of the file in the order of `t_ns`, a slice where nothing changed places.
+        jumps, notes: what was repaired.
+    """
+
+    t_ns: TimesNs
+    order: Any = field(default_factory=lambda: slice(None))
+    jumps: tuple[ClockJump, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def jumps_of(self, channels: Iterable[str]) -> tuple[ClockJump, ...]:
+        """The jumps as those of each of the channels that are in these rows."""
+        return tuple(dataclasses.replace(jump, channel=name) for name in channels for jump in self.jumps)
+
+
+def repaired_rows(times: Mapping[str, TimesNs]) -> dict[str, RowTimes]:
+    """Times of channels that may share a clock, as `repair_together` repairs them, and in order."""
+    fixed, jumps = repair_together(times)
+    found = {}
+    for name, t_ns in fixed.items():
+        own, late = tuple(jump for jump in jumps if jump.channel == name), sorting(t_ns, name)
+        found[name] = RowTimes(t_ns[late[0]], late[0], own, (late[1],)) if late else RowTimes(t_ns, jumps=own)
+    return found
 
 
 def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:

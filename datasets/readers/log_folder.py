@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.clock import repair_together, sorting
+from terrafusion.datasets.core.clock import repaired_rows
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, CsvTable, read_table
+from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, read_table
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 
@@ -43,14 +43,10 @@ def read(request: Request) -> list[Recording]:
     paths = {name: path for name in CHANNELS if (path := _csv_of(folder, name)) is not None}
     in_order = not request.repair_clock
     tables = {name: read_table(path, COLUMNS[name], in_order=in_order) for name, path in paths.items()}
-    jumps: tuple[ClockJump, ...] = ()
-    notes: list[str] = []
-    if request.repair_clock:
-        clocks, jumps = repair_together({name: table.t_ns for name, table in tables.items()})
-        jumps = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + meta.start_ns) for jump in jumps)
-        tables = {
-            name: _sorted(dataclasses.replace(tables[name], t_ns=t), notes) for name, t in clocks.items()
-        }
+    times = {name: table.t_ns for name, table in tables.items()}
+    clocks = repaired_rows(times) if request.repair_clock else {}
+    for name, own in clocks.items():
+        tables[name] = dataclasses.replace(tables[name].select(own.order), t_ns=own.t_ns)
     reader, channels = ChannelReader(tables, meta, rig=request.rig), {}
     for name in CHANNELS:
         with errors_of(paths.get(name, folder)):
@@ -58,9 +54,11 @@ def read(request: Request) -> list[Recording]:
     if not any(channel is not None and len(channel) for channel in channels.values()):
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
-    notes = [*reader.notes, *notes, *_unknown_files(folder)]
+    notes = [*reader.notes, *(note for own in clocks.values() for note in own.notes), *_unknown_files(folder)]
     recording = recording_of(channels, meta, folder.resolve().name, notes)
-    return [dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *jumps))]
+    jumps = (jump for own in clocks.values() for jump in own.jumps)
+    moved = (dataclasses.replace(jump, t_ns=jump.t_ns + meta.start_ns) for jump in jumps)
+    return [dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))]
 
 
 def _meta(folder: Path) -> Meta:
@@ -77,14 +75,6 @@ def _meta(folder: Path) -> Meta:
     if vehicle.suffix in (".yaml", ".yml") and vehicle.is_file():
         return dataclasses.replace(meta, vehicle=str(vehicle.resolve()))
     return meta
-
-
-def _sorted(table: CsvTable, notes: list[str]) -> CsvTable:
-    late = sorting(table.t_ns, table.file.partition(".")[0])
-    if late is None:
-        return table
-    notes.append(late[1])
-    return table.select(late[0])
 
 
 def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequence[str]) -> Recording:

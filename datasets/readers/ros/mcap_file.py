@@ -47,9 +47,8 @@ class McapFile:
         self._file, self._end = path.open("rb"), path.stat().st_size
         try:
             self._refuse_cut()
-            summary = (
-                SeekingReader(self._file, record_size_limit=limits.CHUNK_BYTES).get_summary() or Summary()
-            )
+            reader = SeekingReader(self._file, record_size_limit=limits.CHUNK_BYTES)
+            summary = reader.get_summary() or Summary()
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunks = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
             counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimeRows, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.clock import RowTimes
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import with_assumed_sigma
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.rows import RowTimes
 
 Datum = tuple[float, float, float]
 

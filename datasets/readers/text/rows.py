@@ -1,16 +1,15 @@
 """Files of nothing but numbers, one row a time, of known columns; times in order, repaired, or refused."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
-from terrafusion.datasets.core.clock import repair, repair_together, sorting
+from terrafusion.datasets.core.clock import RowTimes, repaired_rows
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.recording import ClockJump
@@ -108,14 +107,10 @@ def put_in_time(
                 what = f"the time of {name} runs backwards by {by_s:.6f} s"
                 raise rows.error(int(back[0]) + 1, what, REPAIR)
         return dict(parts), (), ()
-    times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
-    notes, out = [], {}
-    for name, rows in parts.items():
-        out[name] = dataclasses.replace(rows, t_ns=times[name])
-        if (late := sorting(times[name], name)) is not None:
-            out[name] = out[name].select(late[0])
-            notes.append(late[1])
-    return out, jumps, tuple(notes)
+    found = repaired_rows({name: rows.t_ns for name, rows in parts.items()})
+    out = {n: dataclasses.replace(parts[n].select(own.order), t_ns=own.t_ns) for n, own in found.items()}
+    jumps = tuple(jump for own in found.values() for jump in own.jumps)
+    return out, jumps, tuple(note for own in found.values() for note in own.notes)
 
 
 def are_numbers(head: bytes) -> bool:
@@ -133,26 +128,6 @@ def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, .
     if sorted(names) != sorted(columns):
         raise DataError(f"the header is '{shown(line)}'", remedy=f"give {', '.join(columns)}")
     return names
-
-
-@dataclass(frozen=True, eq=False)
-class RowTimes:
-    """Times that never decrease.
-
-    Attributes:
-        t_ns: (N,) int64.
-        order: rows of the file in the order of `t_ns`, a slice where nothing changed places.
-        jumps, notes: what was repaired.
-    """
-
-    t_ns: TimesNs
-    order: Any = field(default_factory=lambda: slice(None))
-    jumps: tuple[ClockJump, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def jumps_of(self, channels: Iterable[str]) -> tuple[ClockJump, ...]:
-        """The jumps as those of each of the channels that are in these rows."""
-        return tuple(dataclasses.replace(jump, channel=name) for name in channels for jump in self.jumps)
 
 
 def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
@@ -173,9 +148,4 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
         i = int(back[0])
         what = f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}"
         raise DataError(what, channel=channel, time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9, remedy=REPAIR)
-    repaired, jumps = repair(t_ns, channel)
-    late = sorting(repaired, channel)
-    if late is None:
-        return RowTimes(repaired, jumps=jumps)
-    order, note = late
-    return RowTimes(repaired[order], order, jumps, (note,))
+    return repaired_rows({channel: t_ns})[channel]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.clock import RowTimes
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_from_ecef
@@ -29,7 +30,7 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_recording
-from terrafusion.datasets.readers.text.rows import RowTimes, row_times
+from terrafusion.datasets.readers.text.rows import row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
 POSITIONS = {

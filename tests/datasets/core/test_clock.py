@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core.clock import in_order, repair, repair_together
+from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 
@@ -27,6 +27,12 @@ def stepped(t_ns: np.ndarray, *steps: tuple[int, float]) -> np.ndarray:
     for row, step_s in steps:
         t_ns[row:] += round(step_s * S)
     return t_ns
+
+
+def repair(t_ns: np.ndarray, channel: str) -> tuple[np.ndarray, tuple[ClockJump, ...]]:
+    """The repaired times of one channel, and its steps."""
+    fixed, jumps = repair_together({channel: t_ns})
+    return fixed[channel], jumps
 
 
 def test_a_good_clock_is_left_alone() -> None:
