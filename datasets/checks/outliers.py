@@ -137,17 +137,12 @@ MOST_ROWS = 0.2
 LONGEST_DAYS = 30.0
 """No run lasts longer; grids over such a time would not fit into memory either."""
 LIMITS = {
-    ("command", "_mps"): 100.0,
-    ("command", "_radps"): 100.0,
-    ("wheels", "_mps"): 100.0,
-    ("wheels", "_radps"): 1000.0,
-    ("imu", "_radps"): 100.0,
-    ("imu", "_mps2"): 2000.0,
-    ("gnss", "_m"): 2e7,
-    ("gnss", "_mps"): 1e4,
-    ("motor", "_a"): 1e5,
-    ("motor", "_v"): 1e5,
-    ("truth", "_m"): 2e7,
+    "command": {"mps": 100.0, "radps": 100.0},
+    "wheels": {"mps": 100.0, "radps": 1000.0},
+    "imu": {"radps": 100.0, "mps2": 2000.0},
+    "gnss": {"m": 2e7, "mps": 1e4},
+    "motor": {"a": 1e5, "v": 1e5},
+    "truth": {"m": 2e7},
 }
 """Magnitudes that nothing on a ground robot reaches, by channel and unit. MEMS gyros end at 70 rad/s
 (4000 deg/s), accelerometers at 2000 m/s2 (200 g); projected coordinates at 1e7 m."""
@@ -159,7 +154,7 @@ def check_magnitude(context: CheckContext) -> Iterator[Finding]:
     for name, (t_ns, _) in tables.items():
         yield from _check_duration(context, name, t_ns)
     for name, (t_ns, columns) in tables.items():
-        limits = {column: LIMITS.get((name, f"_{column.rpartition('_')[2]}"), np.inf) for column in columns}
+        limits = {column: LIMITS.get(name, {}).get(column.rpartition("_")[2], np.inf) for column in columns}
         limited = {column: values for column, values in columns.items() if np.isfinite(limits[column])}
         beyond = {column: np.abs(values) > limits[column] for column, values in limited.items()}
         beyond = {column: mask for column, mask in beyond.items() if mask.any()}

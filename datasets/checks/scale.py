@@ -3,7 +3,6 @@ stands), and the gyro about z against the yaw of the truth, else against the sha
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -43,22 +42,11 @@ MOST_GYRO = 0.2
 """Beyond this it is no scale, but another unit or axis."""
 
 
-@dataclass(frozen=True)
-class SpeedUnit:
-    """A unit that speeds may be in, and the factor that converts them to that of their column."""
-
-    name: str
-    factor: float
-
-
 UNITS = {
-    "radps": (
-        SpeedUnit("rev/min", 2.0 * np.pi / 60.0),
-        SpeedUnit("deg/s", np.pi / 180.0),
-        SpeedUnit("rev/s", 2.0 * np.pi),
-    ),
-    "mps": (SpeedUnit("km/h", 1.0 / 3.6), SpeedUnit("cm/s", 0.01), SpeedUnit("mm/s", 0.001)),
+    "radps": {"rev/min": 2.0 * np.pi / 60.0, "deg/s": np.pi / 180.0, "rev/s": 2.0 * np.pi},
+    "mps": {"km/h": 1.0 / 3.6, "cm/s": 0.01, "mm/s": 0.001},
 }
+"""Units that speeds may be in, and the factors that convert them to that of their column."""
 
 
 def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
@@ -76,8 +64,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
     known = 1.0 + context.known("wheel_scale")
     units = _fitting_units(context, scale, float(np.std(fits.scale) / np.median(fits.scale)))
     if units:
-        factor = units[0].factor
-        names = " or ".join(unit.name for unit in units)
+        factor, names = next(iter(units.values())), " or ".join(units)
         yield Finding(
             "wheel-unit", "error", "wheels",
             f"the speeds look like {names}: the ground speed is {scale.ratio:.3g} times as large",
@@ -132,22 +119,24 @@ def command_ratio(context: CheckContext) -> float | None:
     return float(np.sqrt(power[1] / power[0])) if r > 0.8 else None
 
 
-def _fitting_units(context: CheckContext, scale: PathScale, spread: float) -> list[SpeedUnit]:
+def _fitting_units(context: CheckContext, scale: PathScale, spread: float) -> dict[str, float]:
     """The units that explain the ratio, where slip does not."""
     wheels, radius = context.recording.wheels, context.wheel_radius_m()
     assert wheels is not None
     assert radius is not None
-    units = list(UNITS[wheels.unit])
+    units = dict(UNITS[wheels.unit])
     if wheels.unit == "radps":
-        units.append(SpeedUnit("m/s", 1.0 / radius))
+        units["m/s"] = 1.0 / radius
     elif (true_radius := context.true_radius_m()) is not None:
-        units.append(SpeedUnit("rad/s", true_radius))
-    fitting = [unit for unit in units if abs(scale.ratio / unit.factor - 1.0) < UNIT_ERROR]
+        units["rad/s"] = true_radius
+    fitting = {name: factor for name, factor in units.items() if abs(scale.ratio / factor - 1.0) < UNIT_ERROR}
     commanded = command_ratio(context)
     if commanded is not None:
-        return [unit for unit in fitting if abs(commanded / unit.factor - 1.0) < 2.0 * UNIT_ERROR]
+        return {
+            n: factor for n, factor in fitting.items() if abs(commanded / factor - 1.0) < 2.0 * UNIT_ERROR
+        }
     rated = float(np.nanpercentile(np.abs(wheels.side_speeds_mps(radius)), 95))
-    return fitting if scale.ratio > 1.0 or (rated > FAST_MPS and spread < EVEN) else []
+    return fitting if scale.ratio > 1.0 or (rated > FAST_MPS and spread < EVEN) else {}
 
 
 def _descent(recording: Recording) -> float:

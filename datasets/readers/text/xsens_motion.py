@@ -4,13 +4,13 @@ The clock is UTC, the device's ticks, or packets at the update rate; rates come 
 """
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Imu
+from terrafusion.datasets.core.clock import RowTimes
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.readers.delimited import TextTable
@@ -126,17 +126,8 @@ SLOWEST_HZ = 1.0
 """An MTi sends no slower; longer steps mean that the ticks are not of 10 kHz."""
 
 
-@dataclass(frozen=True, eq=False)
-class DeviceClock:
-    """Times (M,) of the rows (N,) bool that have one, and notes."""
-
-    t_ns: TimesNs
-    rows: Mask
-    notes: tuple[str, ...]
-
-
-def clock_of(columns: TextTable, settings: dict[str, str]) -> DeviceClock:
-    """The best clock the export has.
+def clock_of(columns: TextTable, settings: dict[str, str]) -> RowTimes:
+    """The best clock the export has, and the rows that have a time by it.
 
     UTC on every row is taken as it is. Else the ticks count from one to the next row, and the
     median of their distance to the UTC rows gives the date, where there are any.
@@ -148,7 +139,7 @@ def clock_of(columns: TextTable, settings: dict[str, str]) -> DeviceClock:
     ticks = columns.numbers.get("SampleTimeFine")
     counter = next((columns.numbers[n] for n in ("PacketCounter", "Counter") if n in columns.numbers), None)
     if valid.all() or (valid.any() and not _known(ticks) and not _known(counter)):
-        return DeviceClock(utc[valid], valid, _left_out(valid))
+        return RowTimes(utc[valid], valid, notes=_left_out(valid))
     if _known(ticks):
         assert ticks is not None
         rows = np.isfinite(ticks)
@@ -164,7 +155,7 @@ def clock_of(columns: TextTable, settings: dict[str, str]) -> DeviceClock:
     else:
         raise DataError("no row has a time", remedy="export SampleTimeFine, UTC time or PacketCounter")
     t_ns, date_note = _dated(t_ns, utc[rows], valid[rows])
-    return DeviceClock(t_ns, rows, (*notes, date_note, *_left_out(rows)))
+    return RowTimes(t_ns, rows, notes=(*notes, date_note, *_left_out(rows)))
 
 
 def _known(values: Array | None) -> bool:

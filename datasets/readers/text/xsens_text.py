@@ -72,7 +72,7 @@ def read(request: Request) -> list[Recording]:
     columns, settings, notes = _columns(request.path)
     clock = clock_of(columns, settings)
     times = row_times(request, "imu", clock.t_ns)
-    columns = columns.select(clock.rows).select(times.order)
+    columns = columns.select(clock.order).select(times.order)
     notes += [*columns.notes, *clock.notes, *times.notes]
     imu, more = inertial(columns, times.t_ns, settings)
     gnss, datum, of_gnss = _gnss(request, columns, times.t_ns, settings)
