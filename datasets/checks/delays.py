@@ -421,7 +421,7 @@ def opposed(lag: Lag, one: Signal, other: Signal) -> bool:
 
     width = round(0.5 / GRID_S)
     here, *there = (uniform_filter1d(v, width) for v, _ in _on_grid(one, other, 0.0, lag.seconds))
-    return -_correlation(here, there[0]) > _correlation(here, there[1]) - 0.1
+    return len(here) > 1 and -_correlation(here, there[0]) > _correlation(here, there[1]) - 0.1
 
 
 def _on_grid(one: Signal, other: Signal, *later_s: float) -> list[tuple[Array, Mask]]:
