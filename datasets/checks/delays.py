@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
@@ -15,19 +16,6 @@ from terrafusion.datasets.checks.finding import (
     period_s,
     retimed,
     retiming,
-)
-from terrafusion.datasets.checks.motion import (
-    LEAST_R,
-    SPEED_PAIRS,
-    YAW_PAIRS,
-    Pair,
-    SensorPairs,
-    Signal,
-    far_lag,
-    near_lag,
-    odd_one,
-    reason,
-    signal_pairs,
 )
 from terrafusion.datasets.checks.path import path_by
 from terrafusion.datasets.checks.path_model import path_model
@@ -76,7 +64,7 @@ class Drift:
         return Drift(self.anchor_ns, -self.offset_s / self.scale, 1.0 / self.scale, self.spread, self.r)
 
 
-def clock_jumps(recording: Recording, pairs: SensorPairs) -> dict[str, list[JumpAhead]]:
+def clock_jumps(recording: Recording, pairs: motion.SensorPairs) -> dict[str, list[JumpAhead]]:
     """Jumps ahead of single clocks, by channel.
 
     A gap is a jump if the samples after it fit the other channels only when shifted back or, where
@@ -135,16 +123,16 @@ def _candidates(t_ns: TimesNs) -> list[JumpAhead]:
 
 
 def _fits_moved_back(
-    own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int, jump: JumpAhead
+    own: int, signals: tuple[motion.Signal, motion.Signal], rows: slice, moved_ns: int, jump: JumpAhead
 ) -> bool | None:
     """Whether the rows after a jump fit the other signal only when shifted back; None where nothing fits."""
     other, (t_ns, values) = signals[1 - own], signals[own]
-    before = near_lag(other, (t_ns[: jump.row], values[: jump.row]))
-    usual_s = before.seconds if before is not None and before.r > LEAST_R and not moved_ns else 0.0
+    before = motion.near_lag(other, (t_ns[: jump.row], values[: jump.row]))
+    usual_s = before.seconds if before is not None and before.r > motion.LEAST_R and not moved_ns else 0.0
     t_ns, values = t_ns[rows] - moved_ns, values[rows]
-    stay, back = (near_lag(other, (t_ns - step, values)) for step in (0, jump.step_ns))
+    stay, back = (motion.near_lag(other, (t_ns - step, values)) for step in (0, jump.step_ns))
     r_stay, r_back = (_fit(lag, usual_s, jump.step_ns * 1e-9) for lag in (stay, back))
-    return r_back > r_stay + 0.05 if max(r_stay, r_back) > LEAST_R else None
+    return r_back > r_stay + 0.05 if max(r_stay, r_back) > motion.LEAST_R else None
 
 
 def _fit(lag: Lag | None, usual_s: float, step_s: float) -> float:
@@ -164,7 +152,7 @@ def _ends_late(recording: Recording, name: str, step_ns: int) -> bool:
     return abs(own[0] - start_ns) < slack_ns and abs(own[-1] - end_ns - step_ns) < slack_ns
 
 
-def clock_drifts(recording: Recording, pairs: SensorPairs) -> dict[Pair, Drift]:
+def clock_drifts(recording: Recording, pairs: motion.SensorPairs) -> dict[motion.Pair, Drift]:
     """Drifts of the second clock of a pair against the first: durations and growing lags agree on it."""
     clocks, found = clocks_of(recording), {}
     for pair, signals in pairs.items():
@@ -177,7 +165,7 @@ def clock_drifts(recording: Recording, pairs: SensorPairs) -> dict[Pair, Drift]:
     return found
 
 
-def _drift(one: Signal, other: Signal, rate: float) -> Drift | None:
+def _drift(one: motion.Signal, other: motion.Signal, rate: float) -> Drift | None:
     """The drift of the second clock by the lags at both ends of the log, where they agree with `rate`.
 
     The lags are measured on the clock as corrected so far, so that the drift does not blur them.
@@ -198,7 +186,9 @@ def _drift(one: Signal, other: Signal, rate: float) -> Drift | None:
     return drift
 
 
-def _growing_lag(one: Signal, other: Signal, anchor: int) -> tuple[float, float, float, float] | None:
+def _growing_lag(
+    one: motion.Signal, other: motion.Signal, anchor: int
+) -> tuple[float, float, float, float] | None:
     """Lag at the anchor, its growth with 95 % interval, and the correlation, from both ends of the log."""
     start, end = float(max(one[0][0], other[0][0])), float(min(one[0][-1], other[0][-1]))
     window = max(DRIFT_WINDOW_S * 1e9, 0.2 * (end - start))
@@ -207,8 +197,8 @@ def _growing_lag(one: Signal, other: Signal, anchor: int) -> tuple[float, float,
     lags = []
     for begin in (start, end - window):
         part = [(t >= begin) & (t < begin + window) for t in (one[0], other[0])]
-        lag = near_lag((one[0][part[0]], one[1][part[0]]), (other[0][part[1]], other[1][part[1]]))
-        if lag is None or lag.r < LEAST_R:
+        lag = motion.near_lag((one[0][part[0]], one[1][part[0]]), (other[0][part[1]], other[1][part[1]]))
+        if lag is None or lag.r < motion.LEAST_R:
             return None
         lags.append(lag)
     apart_s = (end - start - window) * 1e-9
@@ -226,7 +216,7 @@ def _odd_duration(recording: Recording, names: set[str]) -> str:
     return max(sorted(names), key=lambda name: (oddness[name], period_s(clocks_of(recording)[name])))
 
 
-def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
+def drift_finding(recording: Recording, drifts: dict[motion.Pair, Drift]) -> Finding:
     """The finding on the clock that drifts."""
     name = _odd_duration(recording, {name for pair in drifts for name in pair})
     pair = min((p for p in drifts if name in p), key=lambda p: drifts[p].spread)
@@ -238,12 +228,12 @@ def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
         f"its clock runs {abs(rate):.2%} too {'fast' if rate > 0 else 'slow'}",
         f"{rate:+.3%} +- {drift.spread:.3%} against {against} by the lags at both ends of the log "
         f"(correlation {drift.r:.2f}); their durations differ by the same rate",
-        f"scale the times of {name} about its first; {reason(name, set(drifts))}",
+        f"scale the times of {name} about its first; {motion.reason(name, set(drifts))}",
         retiming(name, scaled.corrected),
     )  # fmt: skip
 
 
-LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
+LEAST_LAG_S = dict.fromkeys(motion.YAW_PAIRS, 0.1) | dict.fromkeys(motion.SPEED_PAIRS, 0.2)
 """Smaller lags are no finding; slip distorts the speed of wheels, so that theirs may be larger."""
 ERROR_FROM_S = 0.5
 """An interval that is all beyond this is an error."""
@@ -262,7 +252,7 @@ FOLLOWS_AFTER = (0.7, 1.0, 1.4, 2.0)
 
 def check_clocks(context: CheckContext) -> Iterator[Finding]:
     """Clocks compared with each other. A jump hides a drift, either hides an offset: the first counts."""
-    pairs = signal_pairs(CheckContext(without_stuck(context), context.rig))
+    pairs = motion.signal_pairs(CheckContext(without_stuck(context), context.rig))
     jumps = clock_jumps(context.recording, pairs)
     yield from gap_findings(context, {name: [jump.row for jump in found] for name, found in jumps.items()})
     if jumps:
@@ -272,7 +262,7 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     else:
         corrected = _on_one_clock(context)
         if corrected is not context:
-            pairs = signal_pairs(CheckContext(without_stuck(corrected), context.rig))
+            pairs = motion.signal_pairs(CheckContext(without_stuck(corrected), context.rig))
         lags, wheels_slip = sensor_lags(pairs)
         off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
         if off:
@@ -295,12 +285,12 @@ def _on_one_clock(context: CheckContext) -> CheckContext:
     return dataclasses.replace(context, recording=recording)
 
 
-def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
+def sensor_lags(pairs: motion.SensorPairs) -> tuple[dict[motion.Pair, Lag], bool]:
     """Lags between sensors of the same motion, and whether the wheels slip and drag the body after them."""
     lags, wheels_slip = {}, False
     for pair, signals in pairs.items():
-        lag = far_lag(*signals)
-        if lag is None or lag.r < LEAST_R:
+        lag = motion.far_lag(*signals)
+        if lag is None or lag.r < motion.LEAST_R:
             continue
         suspect = _matters(pair, lag, *signals)
         if suspect and pair[1] == "wheels" and lag.seconds < 0.0 and _follows(lag, *signals):
@@ -310,7 +300,7 @@ def sensor_lags(pairs: SensorPairs) -> tuple[dict[Pair, Lag], bool]:
     return lags, wheels_slip
 
 
-def _confirms(pair: Pair, lag: Lag, off: dict[Pair, Lag]) -> bool:
+def _confirms(pair: motion.Pair, lag: Lag, off: dict[motion.Pair, Lag]) -> bool:
     """Whether a lag, too small to matter alone, is that of a channel that is off against another one, too."""
     for name in pair:
         for other, found in off.items():
@@ -342,9 +332,9 @@ def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pair]) -> Finding:
+def offset_finding(recording: Recording, off: dict[motion.Pair, Lag], measured: set[motion.Pair]) -> Finding:
     """The finding on the channel that disagrees with most others, of those that could be compared."""
-    name = odd_one(recording, set(off), measured)
+    name = motion.odd_one(recording, set(off), measured)
     pair = min((p for p in off if name in p), key=lambda p: off[p].high_s - off[p].low_s)
     lag, against = off[pair], pair[0] if name == pair[1] else pair[1]
     if name == pair[0]:
@@ -357,12 +347,12 @@ def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pai
         name,
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",
-        f"move the times of {name} by {-lag.seconds:+.3f} s; {reason(name, set(off))}",
+        f"move the times of {name} by {-lag.seconds:+.3f} s; {motion.reason(name, set(off))}",
         retiming(name, lambda t_ns: t_ns - round(lag.seconds * 1e9)),
     )
 
 
-def _matters(pair: Pair, lag: Lag, one: Signal, other: Signal) -> bool:
+def _matters(pair: motion.Pair, lag: Lag, one: motion.Signal, other: motion.Signal) -> bool:
     """Whether a lag is large, and its interval clear of what half a sample and slip may cause."""
     least = LEAST_LAG_S[pair]
     sample_s = max(period_s(one[0]), period_s(other[0]))
@@ -376,7 +366,7 @@ def _distance_to_zero_s(lag: Lag) -> float:
     return min(abs(lag.low_s), abs(lag.high_s)) if lag.low_s * lag.high_s > 0.0 else 0.0
 
 
-def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
+def _without_smoothing(lag: Lag, one: motion.Signal, other: motion.Signal) -> Lag:
     """The lag less that of a moving average in the second signal: a filter is not a clock.
 
     Odometry often averages its last samples, which delays it by half their span. The length is that
@@ -399,7 +389,7 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
     )
 
 
-def _follows(lag: Lag, body: Signal, wheels: Signal) -> bool:
+def _follows(lag: Lag, body: motion.Signal, wheels: motion.Signal) -> bool:
     """Whether the body follows its wheels as through a first-order lag, at least as well as by a pure delay.
 
     Wheels that slip drag the body after them: quick changes arrive smaller and sooner than slow ones. Behind
@@ -415,7 +405,7 @@ def _follows(lag: Lag, body: Signal, wheels: Signal) -> bool:
     return r >= _correlation(a[known], later[known])
 
 
-def opposed(lag: Lag, one: Signal, other: Signal) -> bool:
+def opposed(lag: Lag, one: motion.Signal, other: motion.Signal) -> bool:
     """Whether the two agree about as well without the lag but with one sign changed: a sign, no clock."""
     from scipy.ndimage import uniform_filter1d
 
@@ -424,14 +414,14 @@ def opposed(lag: Lag, one: Signal, other: Signal) -> bool:
     return len(here) > 1 and -_correlation(here, there[0]) > _correlation(here, there[1]) - 0.1
 
 
-def _on_grid(one: Signal, other: Signal, *later_s: float) -> list[tuple[Array, Mask]]:
+def _on_grid(one: motion.Signal, other: motion.Signal, *later_s: float) -> list[tuple[Array, Mask]]:
     """The first signal on a grid over the time of both, then the second so much later; and where known."""
     start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
     grid = np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S)
     return [_resampled(grid, one, start), *(_resampled(grid + s, other, start) for s in later_s)]
 
 
-def _resampled(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, Mask]:
+def _resampled(grid_s: Array, signal: motion.Signal, origin_ns: np.int64) -> tuple[Array, Mask]:
     """A signal at other times, and whether it is known there: away from its gaps."""
     known = np.isfinite(signal[1])
     t_s, values = (signal[0][known] - origin_ns) * 1e-9, signal[1][known]

@@ -15,22 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import messages
 from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import (
-    BarometerSample,
-    CommandSample,
-    GnssSample,
-    ImuSample,
-    MagnetometerSample,
-    Message,
-    MotorSample,
-    SteeringSample,
-    TerrainSample,
-    WheelSample,
-    axles,
-    sides,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +44,7 @@ class Channel(TimeRows):
     name: ClassVar[str] = ""
     COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {}
     """Columns of the log folder by field, (N,) or (N, k)."""
-    SAMPLE: ClassVar[type[Message]]
+    SAMPLE: ClassVar[type[messages.Message]]
     """Type of the channel's messages, whose fields are those of the channel."""
     t_ns: TimesNs
 
@@ -84,7 +71,7 @@ class Channel(TimeRows):
         if values is not None and values.shape != (len(self), width):
             raise ValueError(f"{self.name}: {field} has shape {values.shape}, not ({len(self)}, {width})")
 
-    def samples(self) -> Iterator[Message]:
+    def samples(self) -> Iterator[messages.Message]:
         """One message a row, in order of time."""
         fields = (getattr(self, spec.name) for spec in dataclasses.fields(self))
         make: Any = self.SAMPLE
@@ -122,7 +109,7 @@ class Command(Channel):
         "v_mps": ("v_mps",),
         "yaw_rate_radps": ("yaw_rate_radps",),
     }
-    SAMPLE = CommandSample
+    SAMPLE = messages.CommandSample
     v_mps: Array
     yaw_rate_radps: Array
 
@@ -137,7 +124,7 @@ class Wheels(Channel):
     """
 
     name: ClassVar[str] = "wheels"
-    SAMPLE = WheelSample
+    SAMPLE = messages.WheelSample
     LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("left", "right"),
         ("front_left", "front_right", "rear_left", "rear_right"),
@@ -169,7 +156,7 @@ class Wheels(Channel):
 
     def side_speeds_mps(self, wheel_radius_m: float) -> Array:
         """Circumferential speed (N, 2) of left and right, m/s; both equal where sides are unknown."""
-        return sides(self.speed * (wheel_radius_m if self.unit == "radps" else 1.0), self.names)
+        return messages.sides(self.speed * (wheel_radius_m if self.unit == "radps" else 1.0), self.names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +172,7 @@ class Imu(Channel):
         "gyro_radps": ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"),
         "accel_mps2": ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"),
     }
-    SAMPLE = ImuSample
+    SAMPLE = messages.ImuSample
     gyro_radps: Array
     accel_mps2: Array
 
@@ -208,7 +195,7 @@ class Gnss(Channel):
     """
 
     name: ClassVar[str] = "gnss"
-    SAMPLE = GnssSample
+    SAMPLE = messages.GnssSample
     enu_m: Array
     sigma_enu_m: Array
     fix: NDArray[np.uint8]
@@ -231,7 +218,7 @@ class Gnss(Channel):
         table["fix"] = np.array([Fix(f).name.lower() for f in self.fix], dtype=object)
         return table
 
-    def samples(self) -> Iterator[Message]:
+    def samples(self) -> Iterator[messages.Message]:
         """One message a row."""
         if self.sigma_v_mps is not None:
             return super().samples()
@@ -247,7 +234,7 @@ class Motor(Channel):
         "current_a": ("left_a", "right_a"),
         "voltage_v": ("left_v", "right_v"),
     }
-    SAMPLE = MotorSample
+    SAMPLE = messages.MotorSample
     current_a: Array
     voltage_v: Array | None = None
 
@@ -262,7 +249,7 @@ class Steering(Channel):
     """
 
     name: ClassVar[str] = "steering"
-    SAMPLE = SteeringSample
+    SAMPLE = messages.SteeringSample
     LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("angle",),
         ("front", "rear"),
@@ -283,7 +270,7 @@ class Steering(Channel):
 
     def axle_angles_rad(self, steering_ratio: float = 1.0) -> Array:
         """Mean angle (N, 2) of front and rear wheels, rad; `steering_ratio` is used for a steering wheel."""
-        return axles(self.angle_rad, self.names, steering_ratio)
+        return messages.axles(self.angle_rad, self.names, steering_ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +282,7 @@ class Barometer(Channel):
 
     name: ClassVar[str] = "barometer"
     COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {"pressure_pa": ("pressure_pa",)}
-    SAMPLE = BarometerSample
+    SAMPLE = messages.BarometerSample
     pressure_pa: Array
 
 
@@ -305,7 +292,7 @@ class Magnetometer(Channel):
 
     name: ClassVar[str] = "magnetometer"
     COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {"field_t": ("field_x_t", "field_y_t", "field_z_t")}
-    SAMPLE = MagnetometerSample
+    SAMPLE = messages.MagnetometerSample
     field_t: Array
 
     def __post_init__(self) -> None:
@@ -322,7 +309,7 @@ class Terrain(Channel):
     """
 
     name: ClassVar[str] = "terrain"
-    SAMPLE = TerrainSample
+    SAMPLE = messages.TerrainSample
     label: NDArray[Any]
     source: str = "annotation"
     classes: tuple[str, ...] = ()
@@ -338,9 +325,9 @@ class Terrain(Channel):
             table |= {f"p_{name}": self.probabilities[:, i] for i, name in enumerate(self.classes)}
         return table
 
-    def samples(self) -> Iterator[Message]:
+    def samples(self) -> Iterator[messages.Message]:
         """One message a row."""
         rows = [None] * len(self) if self.probabilities is None else self.probabilities.tolist()
         for t_ns, label, row in zip(self.t_ns.tolist(), self.label, rows, strict=True):
             named = None if row is None else dict(zip(self.classes, row, strict=True))
-            yield TerrainSample(t_ns, str(label), self.source, named)
+            yield messages.TerrainSample(t_ns, str(label), self.source, named)

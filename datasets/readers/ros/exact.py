@@ -28,35 +28,27 @@ from terrafusion.datasets.readers.channel_tables import (
 )
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
+from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.streams import Stream, wanted_fields
-from terrafusion.datasets.readers.ros.topics import (
-    FIELD,
-    IMU,
-    JOINTS,
-    ODOMETRY,
-    PRESSURE,
-    STRING,
-    TWIST_STAMPED,
-)
 
 Key = tuple[str, str]
 """Name and type of a topic."""
 
 PREFIX = "/terrafusion/"
-META: Key = (f"{PREFIX}meta", STRING)
+META: Key = (f"{PREFIX}meta", topics.STRING)
 ROW = "std_msgs/msg/Float64MultiArray"
 STAMP = ("sec", "nanosec")
 """What stands before the columns in a row."""
 
 STANDARD: dict[str, Key] = {
-    "command": ("/cmd_vel", TWIST_STAMPED),
-    "wheels": ("/joint_states", JOINTS),
-    "imu": ("/imu/data", IMU),
-    "barometer": ("/pressure", PRESSURE),
-    "magnetometer": ("/imu/mag", FIELD),
-    "steering": ("/steering/joint_states", JOINTS),
-    "truth": ("/ground_truth/odom", ODOMETRY),
+    "command": ("/cmd_vel", topics.TWIST_STAMPED),
+    "wheels": ("/joint_states", topics.JOINTS),
+    "imu": ("/imu/data", topics.IMU),
+    "barometer": ("/pressure", topics.PRESSURE),
+    "magnetometer": ("/imu/mag", topics.FIELD),
+    "steering": ("/steering/joint_states", topics.JOINTS),
+    "truth": ("/ground_truth/odom", topics.ODOMETRY),
 }
 """Topics whose standard messages hold a channel to the bit, unless it has a table."""
 
