@@ -233,8 +233,10 @@ class ChannelReader:
     def channel(self, name: str) -> Any:
         """The channel, or the truth; None where there is no table, or none of its rows holds a value."""
         table = self._table(name)
-        if table is None or name not in PLAIN:
-            return None if table is None else getattr(self, f"_{name}")(table)
+        if table is None:
+            return None
+        if name not in PLAIN:
+            return getattr(self, f"_{name}")(table)
         parts = PLAIN[name].COLUMNS.values()
         fields = (table.numbers[names[0]] if len(names) == 1 else table.stack(names) for names in parts)
         return PLAIN[name](self._t(table), *fields)
