@@ -3,8 +3,8 @@ references.
 
 A cell's share is its part of the excess of squared errors. Its p-value holds for all cells together: the
 greatest standardised excess over all cells, among replicates of the judged drives (max-T, Westfall and Young
-1993). In a replicate the mean square of a cell scatters as the references' does. It is larger by what is
-unknown of the robot there, and by how much more its scatter from run to run shows than on their drives.
+1993). In a replicate the mean square of a cell scatters as the references' does. It is larger, never smaller,
+by what is unknown of the robot there, and by how much more its scatter shows than on their drives.
 """
 
 import math
@@ -27,7 +27,7 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 LEAST_SAMPLES = 5  # effective, of all runs together, from which a cell is listed (assumed)
 REPLICATES = 299  # of the judged drives
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
-LEAST_SPREAD = 0.05  # variance added to that of the references' log mean squares, in runs (assumed)
+SPREAD_RUNS = 2.0  # weight, in runs, of the variance that the cells of a band have on average (assumed)
 SCATTER_RUNS, SCATTER_DRAWS = 3, 20  # references, and draws each, that show the squares due to scatter
 LEAST_NOISE = 0.25  # least share of the references' mean squares that is noise (assumed)
 UNSEEN = math.log(LOUD)
@@ -110,15 +110,14 @@ def _p_values(
         np.where(count < 1.0, a.reshape(count.shape), b) for a, b in zip(whole, (square, count), strict=True)
     )
     log = np.log((square + 1.0) / (samples + 1.0))[:, kept]
-    normal, R = log[J:].mean(axis=0), len(log) - J
-    centred = np.vstack([log[J:] - normal, np.sqrt(LEAST_SPREAD) * np.eye(len(kept))]) / np.sqrt(R - 1.0)
-    wider = np.sqrt((R - 1.0) / rng.chisquare(R - 1.0, (REPLICATES, 1)))  # a spread known from R runs
-
-    def spread() -> Array:
-        return wider * (rng.standard_normal((REPLICATES, len(centred))) @ centred)
-
-    unseen = UNSEEN * (count[J:, kept].max(axis=0) < 1.0) * rng.standard_normal((REPLICATES, len(kept)))
-    drawn = -spread() / np.sqrt(R)  # of the references' mean
+    normal, R, size = log[J:].mean(axis=0), len(log) - J, (REPLICATES, len(kept))
+    # Each cell's spread is known from R runs and, a little, from that of its band (Smyth 2004).
+    squares, bands = log[J:].var(axis=0) * R, kept % len(BANDS)
+    for band in np.unique(bands):
+        squares[bands == band] += SPREAD_RUNS * squares[bands == band].mean() / (R - 1.0)
+    sd = np.sqrt(squares / rng.chisquare(R - 1.0 + SPREAD_RUNS, size))
+    unseen = UNSEEN * (count[J:, kept].max(axis=0) < 1.0) * rng.standard_normal(size)
+    drawn = -sd * rng.standard_normal(size) / np.sqrt(R)  # of the references' mean
 
     def scattered(runs: Sequence[WhitenedRun], of: Sequence[RunCells]) -> list[Array]:
         draws = drawn_scatter(robot, len(runs), SCATTER_DRAWS, rng)
@@ -131,9 +130,9 @@ def _p_values(
     offsets, scatter = drawn_robots(robot, REPLICATES, rng), scattered(evidence.runs, cells[:J])
     for run, of, own in zip(evidence.runs, cells[:J], scatter, strict=True):
         unknown = _moved(run, of, offsets, sigma)[:, kept]
-        larger = np.log((noise + own + unknown) / (noise + usual))
-        drawn += (normal + larger + unseen + spread()) / J
-    excess, drawn = log[:J].mean(axis=0) - normal, drawn - normal
+        larger = np.log((noise + np.maximum(own + unknown, usual)) / (noise + usual))
+        drawn += (larger + unseen + sd * rng.standard_normal(size)) / J
+    excess = log[:J].mean(axis=0) - normal
     middle, high = np.quantile(drawn, [0.5, 0.95], axis=0)
     least = (excess - middle) / (high - middle)
     tops = ((drawn - middle) / (high - middle)).max(axis=1)
