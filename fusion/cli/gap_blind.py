@@ -13,7 +13,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for blind.json, report.html and the labels.",
-    ("config.json", "labels.*", "commitment.json", "answers.*", "oracle.jsonl", "blind.json", "report.html"),
+    ("config.json", "labels.*", "commitment.json", "answers", "oracle", "blind.json", "report.html"),
     ("labels.salt",),
     goes_on=True,
 )
@@ -39,7 +39,7 @@ def gap_blind(
     """Judge the gap diagnosis on trials whose truth it is not given, and which is fixed before the answers.
 
     The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
-    Writes commitment.json first, answers.jsonl, then blind.json and report.html.
+    Writes commitment.json first, answers, then blind.json and report.html.
 
     Examples:
 

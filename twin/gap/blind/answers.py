@@ -1,25 +1,23 @@
-"""Trials given to a diagnosis and its opponent, and their answers: one line of JSON a trial."""
+"""Trials given to a diagnosis and its opponent, and their answers: one file a trial."""
 
-import contextlib
 import dataclasses
 import functools
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from terrafusion.datasets.core.files import unwritable, write_atomically
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.plan import RUNS, VEHICLE, Trial, specs
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
-ORACLE = "oracle.jsonl"
+ORACLE = "oracle"
 DIAGNOSIS, OPPONENT = "diagnosis", "opponent"
 LANES = 160  # runs of the plant in one batch (about 5 MB each)
 
@@ -87,16 +85,8 @@ def _simulated(block: Sequence[Trial], vehicle: VehicleParams) -> Iterator[Blind
 
 
 def answered(folder: Path, name: str = seal.ANSWERS) -> dict[str, dict[str, Any]]:
-    """Stored answers by trial; a truncated line does not count."""
-    path = folder / name
-    found = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        found[entry["trial"]] = entry
-    return found
+    """Stored answers by trial."""
+    return {path.stem: json.loads(path.read_text("utf-8")) for path in sorted((folder / name).glob("*.json"))}
 
 
 def answer_all(
@@ -108,47 +98,30 @@ def answer_all(
     minutes: float = math.inf,
 ) -> None:
     """Answers of all `methods` to the trials that have none yet, until all are stored, or for so many
-    minutes."""
-    until_s = time.monotonic() + 60.0 * minutes
-    done = answered(folder)
-    _rewrite(folder, done)  # without a line that was cut off
-    missing = [trial for trial in trials if trial.trial not in done]
-    questions = ((case, methods) for case in cases(missing))
+    minutes.
+
+    Raises:
+        DataError: an answer cannot be written.
+    """
+    until_s, done = time.monotonic() + 60.0 * minutes, {*answered(folder)}
+    questions = ((case, methods) for case in cases([t for t in trials if t.trial not in done]))
     for entry in _stored(folder / seal.ANSWERS, questions, pool):
-        done[entry["trial"]] = entry
+        done.add(entry["trial"])
         if progress is not None:
             progress(len(done) / len(trials))
         if time.monotonic() > until_s:
             break
-    _rewrite(folder, done)
 
 
-def _stored(path: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> Iterator[dict[str, Any]]:
-    """Entries as they come, each appended to the file."""
+def _stored(folder: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> Iterator[dict[str, Any]]:
+    """Entries as they come, each written to the folder."""
     with open_workers(pool.backend, pool.jobs, pool.address) as found:
         # Recordings are large: no more of them at once than are worked on soon.
         workers = dataclasses.replace(found, at_once=found.at_once or 2 * pool.jobs)
         for entry in workers.results(answer, questions):
-            _append(path, entry)
+            text = json.dumps(entry)
+            write_atomically(folder / f"{entry['trial']}.json", lambda part, text=text: part.write_text(text))
             yield entry
-
-
-def _append(path: Path, entry: Mapping[str, Any]) -> None:
-    """One more line; where the disk is full, the file stays as it was.
-
-    Raises:
-        DataError: it cannot be written.
-    """
-    size = path.stat().st_size if path.exists() else 0
-    try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            os.truncate(path, size)
-        raise unwritable(path, error) from None
 
 
 def answer(case: BlindCase, methods: Mapping[str, Diagnose]) -> dict[str, Any]:
@@ -171,26 +144,21 @@ def _answer(case: BlindCase, method: Diagnose) -> dict[str, Any]:
 def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, pool: Pool) -> dict[str, float]:
     """Share of the gap that disappears where the diagnosis is given the true effects, by trial.
 
-    For single effects whose answer has a share, once the labels are open; `oracle.jsonl` stores the results.
+    For single effects whose answer has a share, once the labels are open; the folder `oracle` stores them.
     The oracle is called as the diagnosis, with `effects`, the names of the candidates.
     """
     with_share = {t for t, entry in answered(folder).items() if _share(entry) is not None}
-    done = answered(folder, ORACLE)
-    asked = [t for t in trials if t.trial in with_share and t.family in ("same", "shifted")]
-    effects = {t.trial: t.effects() for t in asked}
+    asked = {t.trial: t for t in trials if t.trial in with_share and t.family in ("same", "shifted")}
+    missing = [t for name, t in asked.items() if name not in answered(folder, ORACLE)]
     questions = (
-        (case, {DIAGNOSIS: functools.partial(oracle, effects=effects[case.trial])})
-        for case in cases([t for t in asked if t.trial not in done])
+        (case, {DIAGNOSIS: functools.partial(oracle, effects=asked[case.trial].effects())})
+        for case in cases(missing)
     )
-    done |= {entry["trial"]: entry for entry in _stored(folder / ORACLE, questions, pool)}
-    shares = {t: _share(entry) for t, entry in done.items()}
+    for _ in _stored(folder / ORACLE, questions, pool):
+        pass
+    shares = {t: _share(entry) for t, entry in answered(folder, ORACLE).items()}
     return {t: float(share) for t, share in shares.items() if share is not None}
 
 
 def _share(entry: Mapping[str, Any]) -> float | None:
     return ((entry[DIAGNOSIS]["answer"] or {}).get("shrink") or {}).get("share")
-
-
-def _rewrite(folder: Path, entries: Mapping[str, dict[str, Any]]) -> None:
-    lines = "".join(json.dumps(entries[name]) + "\n" for name in sorted(entries))
-    write_atomically(folder / seal.ANSWERS, lambda part: part.write_text(lines, encoding="utf-8"))

@@ -15,7 +15,7 @@ from typing import Any
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.files import write_atomically
 
-COMMITMENT, SALT, ANSWERS, OPENED = "commitment.json", "labels.salt", "answers.jsonl", "labels.opened.json"
+COMMITMENT, SALT, ANSWERS, OPENED = "commitment.json", "labels.salt", "answers", "labels.opened.json"
 
 
 def commit(folder: Path, labels: str, public: Mapping[str, Any]) -> None:
@@ -46,7 +46,7 @@ def open_labels(folder: Path, labels: str) -> None:
     salt = salt_file.read_text(encoding="utf-8") if salt_file.is_file() else ""
     if _sha256(salt + labels) != (commitment(folder) or {}).get("labels_salted_sha256"):
         raise DataError("the labels are not those committed to", file=folder / COMMITMENT)
-    answers = _sha256((folder / ANSWERS).read_text(encoding="utf-8"))
+    answers = _sha256("".join(p.read_text(encoding="utf-8") for p in sorted((folder / ANSWERS).iterdir())))
     if not path.is_file():
         _write(path, _json({"answers_sha256": answers, "salt": salt, "labels": labels}))
     elif json.loads(path.read_text(encoding="utf-8"))["answers_sha256"] != answers:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.twin.gap.blind import seal
-from terrafusion.twin.gap.blind.answers import _append, answered
+from terrafusion.twin.gap.blind.answers import answered
 from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.plan import (
     PLAIN,
@@ -66,8 +65,7 @@ def test_a_diagnosis_that_breaks_is_wrong_everywhere(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("quickly")
 def test_a_check_resumes_where_it_was_stopped(tmp_path: Path) -> None:
-    """Answers that are there are kept; a line that was cut off is asked for again; another seed is
-    refused."""
+    """Answers that are there are kept; another seed is refused."""
     whole = run_blind_check(tmp_path / "whole", fake.guess, scale=TINY, seed=2)
 
     def stops(*arguments: Any, **more: Any) -> Any:
@@ -79,8 +77,6 @@ def test_a_check_resumes_where_it_was_stopped(tmp_path: Path) -> None:
     stops.calls = 0  # type: ignore[attr-defined]
     with pytest.raises(KeyboardInterrupt):
         run_blind_check(tmp_path / "cut", stops, scale=TINY, seed=2)
-    path = tmp_path / "cut" / seal.ANSWERS
-    path.write_text(path.read_text() + '{"trial": "trial-00')
     assert len(answered(tmp_path / "cut")) == 3
     with pytest.raises(ConfigError, match="another seed or size"):
         run_blind_check(tmp_path / "cut", fake.guess, scale=TINY, seed=3)
@@ -99,16 +95,19 @@ def test_a_check_that_runs_out_of_time_scores_what_is_answered(tmp_path: Path) -
     assert again == scores  # the labels are open: nothing is answered any more
 
 
+@pytest.mark.usefixtures("quickly")
 def test_a_full_disk_is_one_line_and_leaves_no_half_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _append(tmp_path / seal.ANSWERS, {"trial": 1})
-    before = (tmp_path / seal.ANSWERS).read_bytes()
+    whole = Path.write_text
 
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def full(path: Path, text: str, **more: Any) -> int:
+        if path.name.startswith(".trial-0002"):
+            whole(path, text[:5])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return whole(path, text, **more)
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(DataError, match=r"cannot be written: No space left"):
-        _append(tmp_path / seal.ANSWERS, {"trial": 2})
-    assert (tmp_path / seal.ANSWERS).read_bytes() == before == b'{"trial": 1}\n'
+        run_blind_check(tmp_path, fake.guess, scale=TINY, seed=2)
+    assert [path.name for path in (tmp_path / seal.ANSWERS).iterdir()] == ["trial-0001.json"]

@@ -15,7 +15,8 @@ from terrafusion.twin.gap.blind import seal
 @pytest.fixture
 def committed(tmp_path: Path) -> Path:
     seal.commit(tmp_path, "the truth", {"seed": 1})
-    (tmp_path / seal.ANSWERS).write_text("first\n")
+    (tmp_path / seal.ANSWERS).mkdir()
+    (tmp_path / seal.ANSWERS / "trial-1.json").write_text("first\n")
     return tmp_path
 
 
@@ -35,7 +36,7 @@ def test_anyone_can_check_the_commitment_once_the_labels_are_open(committed: Pat
 
 def test_answers_of_after_the_opening_are_refused(committed: Path) -> None:
     seal.open_labels(committed, "the truth")
-    (committed / seal.ANSWERS).write_text("second\n")
+    (committed / seal.ANSWERS / "trial-1.json").write_text("second\n")
     with pytest.raises(DataError, match="answers changed after the labels were opened"):
         seal.open_labels(committed, "the truth")
 
