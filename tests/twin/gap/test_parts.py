@@ -62,10 +62,10 @@ def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, monkeyp
     )
     here = moved_to(log, first, log.start, moved)
     for mine, its in zip(here, there, strict=True):
-        for name in ("value", "by_effect", "by_patch", "by_pose", "heading"):
+        for name in ("value", "columns", "heading"):
             np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=within)
     east = [o.channel for o in log.observed].index("gnss_east_m")
-    assert np.abs(here[east].by_effect - first[east].by_effect).max() > 1e-3
+    assert np.abs(here[east].columns[:, 3:] - first[east].columns[:, 3:]).max() > 1e-3
 
 
 def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
@@ -82,7 +82,7 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
             if observed.channel in ("accel_x_mps2", "wheel_left_radps", "wheel_right_radps"):
                 continue  # a wheel that is about to slide is not linear in anything
             true = (values[i] - plain[i]) / 0.1
-            error = np.linalg.norm(true - found[i].by_effect[:, column])
+            error = np.linalg.norm(true - found[i].columns[:, 3 + column])
             assert error < 0.12 * np.linalg.norm(true) + 0.02 * np.median(observed.sigma) * len(true) ** 0.5
 
 
@@ -101,10 +101,12 @@ def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> No
     assert np.array_equal(all_.fine, some.fine)
     for i, key in enumerate(CANDIDATES.keys):
         if key in keys:
-            np.testing.assert_allclose(some.by_effect[:, :, i], all_.by_effect[:, :, i], rtol=0.0, atol=1e-9)
-            assert np.abs(some.by_effect[:, :, i]).max() > 1e-3
+            np.testing.assert_allclose(
+                some.columns[:, :, 3 + i], all_.columns[:, :, 3 + i], rtol=0.0, atol=1e-9
+            )
+            assert np.abs(some.columns[:, :, 3 + i]).max() > 1e-3
         else:
-            assert not some.by_effect[:, :, i].any()
+            assert not some.columns[:, :, 3 + i].any()
 
 
 @pytest.mark.parametrize(("short", "within"), [(False, 1e-3), (True, 0.05)])

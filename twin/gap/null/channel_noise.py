@@ -102,7 +102,7 @@ def _fit_residuals(
     """Residuals of one run after a fit of its states, effects (1 sigma `size`) and poses, in units of the
     data sheets' sigma, by channel and window."""
     white = whitened(run.without_nuisance(), noise)
-    prior = np.append(sigma**-2.0, np.full(run.by_effect[0].shape[1], size**-2.0))
+    prior = np.append(sigma**-2.0, np.full(run.effects, size**-2.0))
     rows, K = white.rows.astype(float), len(prior)
     fit = np.linalg.solve(white.gram[:K, :K] + np.diag(prior), white.gram[:K, -1])
     rest = physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit)

@@ -55,36 +55,32 @@ class RunResiduals:
     Attributes:
         soil: (S,) the run's soil, in typical sizes from the model's, in the order of `SOIL_SIGMAS`.
         error: (n,) measured less predicted, linearised about that soil.
-        by_state, by_effect, by_nuisance, by_pose: (n, T), (n, K), (n, G) and (n, 3) derivatives.
+        columns: (n, 3 + T + K + G) derivatives by pose, states, effects and nuisance basis.
         by_patch: (n, D) those by patches of ground in the window.
+        states, effects: T, K.
     """
 
     log: PreparedLog
     soil: Array
     error: list[Array]
-    by_state: list[Array]
-    by_effect: list[Array]
-    by_nuisance: list[Array]
-    by_pose: list[Array]
+    columns: list[Array]
     by_patch: list[Array]
+    states: int
+    effects: int
 
     def without_nuisance(self) -> Self:
         """Without the nuisance basis: half of all columns, which only the scores need."""
-        return dataclasses.replace(self, by_nuisance=[p[:, :0] for p in self.by_nuisance])
+        return dataclasses.replace(
+            self, columns=[c[:, : 3 + self.states + self.effects] for c in self.columns]
+        )
 
     def errors_alone(self) -> Self:
-        """Without all columns."""
-        none = [e[:, None][:, :0] for e in self.error]
-        return dataclasses.replace(self, by_state=none, by_effect=none, by_nuisance=none)
+        """Without all columns but those of the poses."""
+        return dataclasses.replace(self, columns=[c[:, :3] for c in self.columns], states=0, effects=0)
 
     def errors_of(self, predicted: Sequence[Array]) -> list[Array]:
         """What was measured less other predictions, one array a channel."""
         return [o.value - y for o, y in zip(self.log.observed, predicted, strict=True)]
-
-    def stacked(self) -> list[Array]:
-        """State, effect, nuisance, error and pose columns of each channel, side by side."""
-        parts = zip(self.by_state, self.by_effect, self.by_nuisance, self.error, self.by_pose, strict=True)
-        return [np.column_stack(columns) for columns in parts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,15 +236,17 @@ def residuals_from(
 ) -> RunResiduals:
     """Errors and derivatives of a run, from its sensitivities."""
     soil, log = soil_columns(candidates), with_timing(log, [s.value for s in found])
-    error, by_state, by_nuisance = [], [], []
+    error, columns, by_patch, K = [], [], [], len(candidates.keys)
     for observed, s in zip(log.observed, found, strict=True):
+        by_pose, by_effect, patches = np.split(s.columns, [3, 3 + K], axis=1)
+        sensors = _sensor_states(observed.channel, s.value, model.vehicle)
+        nuisance = nuisance_columns(log, model, observed, s.heading, channels)
         error.append(observed.value - s.value)
-        own = _sensor_states(observed.channel, s.value, model.vehicle)
-        by_state.append(np.hstack([s.by_effect[:, soil], own]))
-        by_nuisance.append(nuisance_columns(log, model, observed, s.heading, channels))
-    by_effect, by_patch = [s.by_effect for s in found], [s.by_patch for s in found]
-    by_pose = [s.by_pose for s in found]
-    return RunResiduals(log, np.zeros(len(soil)), error, by_state, by_effect, by_nuisance, by_pose, by_patch)
+        columns.append(np.hstack([by_pose, by_effect[:, soil], sensors, by_effect, nuisance]))
+        by_patch.append(patches)
+    return RunResiduals(
+        log, np.zeros(len(soil)), error, columns, by_patch, len(soil) + sensors.shape[1], K
+    )  # fmt: skip
 
 
 def _sensor_states(channel: str, predicted: Array, vehicle: VehicleParams) -> Array:
@@ -336,12 +334,13 @@ def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: 
 
 def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:
     """The run in units and axes in which its noise is white, with the poses projected out."""
-    white = whitened_columns(run.log, noise, run.stacked())
+    both = [np.column_stack(parts) for parts in zip(run.columns, run.error, strict=True)]
+    white = whitened_columns(run.log, noise, both)
     blocks = sample_map(run.log).blocks
     channel = np.concatenate([np.full(len(rows), i) for i, _, rows in blocks])
     window = np.concatenate([np.full(len(rows), k) for _, k, rows in blocks])
     middle = [0.5 * (o.begin_s + o.end_s) for o in run.log.observed]
-    columns, pose_basis = white[:, :-3], white[:, -3:].copy()
+    columns, pose_basis = white[:, 3:], white[:, :3].copy()
     out = np.empty_like(columns)
     for k in np.unique(window):
         mine = window == k
@@ -351,7 +350,7 @@ def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedR
     return WhitenedRun(
         run, out.T @ out, out.astype(np.float32), pose_basis, pose_basis[:, :0], channel,
         np.concatenate([middle[i][rows] for i, _, rows in blocks]), window,
-        run.by_state[0].shape[1], np.zeros((0, len(window))), np.full(len(run.log.observed), np.inf),
+        run.states, np.zeros((0, len(window))), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
 
 

@@ -159,7 +159,7 @@ def at_run_soil(
 
 def referred_to_model(run: RunResiduals, soil: Array, errors: Sequence[Array]) -> list[Array]:
     """Errors on the run's soil (S,) as they would be on the model's, to first order."""
-    return [e + s[:, : len(soil)] @ soil for e, s in zip(errors, run.by_state, strict=True)]
+    return [e + c[:, 3 : 3 + len(soil)] @ soil for e, c in zip(errors, run.columns, strict=True)]
 
 
 def with_run_soil(

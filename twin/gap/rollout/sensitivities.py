@@ -53,29 +53,23 @@ class Linearisation:
     Attributes:
         start: (W, 3) pose at the start of each window.
         fine: (N, Y) outputs at every grid sample of all windows.
-        by_effect, by_pose: (n, Y, K) and (n, Y, 3) derivatives at every `COARSE_STEP`-th sample by the
-            candidates' columns, in typical sizes, and by the pose of the window's start.
-        by_patch: (n, Y, D) derivatives by patches of ground along the path of the window.
+        columns: (n, Y, 3 + K + D) derivatives at every `COARSE_STEP`-th sample: by the pose of the window's
+            start, by the candidates' parameters, in typical sizes, and by patches of ground along the path.
         heading: (n,) yaw of the body.
     """
 
     start: Array
     fine: Array
-    by_effect: Array
-    by_patch: Array
-    by_pose: Array
+    columns: Array
     heading: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """One channel: prediction (n,), derivatives by the columns (n, K), in typical sizes, by patches (n, D)
-    and by the pose (n, 3), heading (n,)."""
+    """One channel: prediction (n,), derivatives (n, 3 + K + D) as in `Linearisation`, heading (n,)."""
 
     value: Array
-    by_effect: Array
-    by_patch: Array
-    by_pose: Array
+    columns: Array
     heading: Array
 
 
@@ -191,8 +185,8 @@ def linearise(
     diverged = ~np.isfinite(by_effect).all(axis=(0, 1))
     by_effect[:, :, diverged] = 0.0
     by_patch = patch_columns(y, by_effect, coarse_counts(log), candidates, model.vehicle.body.track_m)
-    by_pose, heading = _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]]
-    return Linearisation(start, fine, by_effect, by_patch, by_pose, heading)
+    columns = np.concatenate([_by_pose(log, coarse, y), by_effect, by_patch], axis=2)
+    return Linearisation(start, fine, columns, coarse[:, INDEX["yaw"]])
 
 
 def _readings(
@@ -233,11 +227,8 @@ def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitiv
     at, out = sample_map(log), []
     for observed, fine, coarse in zip(log.observed, at.fine, at.coarse, strict=True):
         value = weighted_means(fine, _channel(run.fine, observed.channel))
-        by_effect, by_patch, by_pose = (
-            weighted_means(coarse, _channel(part, observed.channel))
-            for part in (run.by_effect, run.by_patch, run.by_pose)
-        )
-        out.append(Sensitivity(value, by_effect, by_patch, by_pose, run.heading[coarse[0][:, 2]]))
+        columns = weighted_means(coarse, _channel(run.columns, observed.channel))
+        out.append(Sensitivity(value, columns, run.heading[coarse[0][:, 2]]))
     return out
 
 
@@ -247,15 +238,11 @@ def moved_to(log: PreparedLog, channels: Sequence[Sensitivity], old: Array, new:
         return list(channels)
     turn = new[:, 2] - old[:, 2]
     value = moved(log, [s.value for s in channels], old, new)
-    by_effect, by_patch, by_pose = (
-        rotated(log, [getattr(s, name) for s in channels], turn)
-        for name in ("by_effect", "by_patch", "by_pose")
-    )
+    columns = rotated(log, [s.columns for s in channels], turn)
     out = []
     for i, s in enumerate(channels):
-        by_pose[i] = np.column_stack([s.by_pose[:, :2], by_pose[i][:, 2]])  # of x and y, whatever the pose
-        heading = s.heading + turn[window_index(log, i)]
-        out.append(Sensitivity(value[i], by_effect[i], by_patch[i], by_pose[i], heading))
+        columns[i][:, :2] = s.columns[:, :2]  # by x and y, whatever the pose
+        out.append(Sensitivity(value[i], columns[i], s.heading + turn[window_index(log, i)]))
     return out
 
 

@@ -44,10 +44,10 @@ def drawn(of: RunResiduals, seed: int, patches: float, effect: float) -> RunResi
     """With errors of nothing but white noise, patches of the ground and a gyro bias, typical sizes."""
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((len(of.log.windows), of.by_patch[0].shape[1]))
-    bias, errors = CANDIDATES.keys.index("gyro_bias/constant"), []
-    for observed, by_patch, by_effect in zip(of.log.observed, of.by_patch, of.by_effect, strict=True):
+    bias, errors = 3 + of.states + CANDIDATES.keys.index("gyro_bias/constant"), []
+    for observed, by_patch, columns in zip(of.log.observed, of.by_patch, of.columns, strict=True):
         window = np.searchsorted(of.log.windows[1:, 0] * 0.01, 0.5 * (observed.begin_s + observed.end_s))
-        error = observed.sigma * rng.standard_normal(len(observed.sigma)) + effect * by_effect[:, bias]
+        error = observed.sigma * rng.standard_normal(len(observed.sigma)) + effect * columns[:, bias]
         errors.append(error + patches * np.einsum("ij,ij->i", by_patch, z[window]))
     return dataclasses.replace(of, error=errors)
 
