@@ -1,7 +1,17 @@
-"""Linear algebra in the calling thread."""
+"""Runs in threads of their own, linear algebra in the calling thread."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def in_threads(jobs: int, function: Callable[..., T], *arguments: Iterable[object]) -> list[T]:
+    """Results of the function for each set of arguments, in their order, from so many threads."""
+    with ThreadPoolExecutor(jobs) as threads:
+        return list(threads.map(function, *arguments))
 
 
 @contextlib.contextmanager

@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
 from typing import Self
@@ -31,6 +30,7 @@ from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
+from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.file import scenario_of
@@ -94,9 +94,8 @@ class Planner:
     def propose(self, one: Cause, other: Cause) -> NextRun:
         """The drive on which two causes differ most; a direct measurement where none separates them."""
         effects = {one.effect, other.effect}
-        with ThreadPoolExecutor(self.evidence.jobs) as threads:
-            information = threads.map(lambda name: self.forecast(name, effects), drives())
-            found = dict(zip(drives(), information, strict=True))
+        information = in_threads(self.evidence.jobs, lambda name: self.forecast(name, effects), drives())
+        found = dict(zip(drives(), information, strict=True))
 
         def sigmas(name: str, repeats: int = 1) -> float:
             return self.separation(one, other, repeats * found[name])

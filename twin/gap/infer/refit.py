@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.arrays import Array
@@ -11,6 +10,7 @@ from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import whitened_error
 from terrafusion.twin.gap.rollout.run_soil import referred_to_model, with_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
+from terrafusion.twin.gap.threads import in_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,5 +41,4 @@ def whitened_errors(
         error = referred_to_model(run.residuals, applied[i][1], run.residuals.errors_of(y))
         return whitened_error(run, evidence.noise, error, clip)
 
-    with ThreadPoolExecutor(evidence.jobs) as threads:
-        return list(threads.map(whitened, range(len(tried))))
+    return in_threads(evidence.jobs, whitened, range(len(tried)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     physical_error,
     whitened,
 )
+from terrafusion.twin.gap.threads import in_threads
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
@@ -53,13 +53,12 @@ def learn_noise(
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
     noise, sigma, lags = before or data_sheet_noise(every), initial_state_sigma(candidates), _lags(every)
-    with ThreadPoolExecutor(jobs) as threads:
-        for _ in range(1 if before else 2):
-            now, series = noise, dict[str, Series]()
-            for found in threads.map(lambda run, now=now: _fit_residuals(run, now, sigma, size), runs):
-                for channel, pairs in found.items():
-                    series.setdefault(channel, []).extend(pairs)
-            noise = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
+    for _ in range(1 if before else 2):
+        now, series = noise, dict[str, Series]()
+        for found in in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs):
+            for channel, pairs in found.items():
+                series.setdefault(channel, []).extend(pairs)
+        noise = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
     return noise
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.arrays import Array
@@ -28,6 +27,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.run_soil import at_run_soil, soil_limit
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
+from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.model.vehicle import VehicleParams
 
 
@@ -105,11 +105,10 @@ def gather_evidence(
     limited = iter(at_run_soil([*itertools.compress(residuals, beyond)], linearised, first, limit, jobs))
     every = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
     noise = learn_noise(every[R:], every[:R], candidates, jobs, first)
-    with ThreadPoolExecutor(jobs) as threads:
-        errors = list(threads.map(lambda run: whitened(run.errors_alone(), noise), every))
-        usual = reference_loudness(errors[R:])
-        every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
-        white = list(threads.map(lambda run: whitened(run, noise), every))
+    errors = in_threads(jobs, lambda run: whitened(run.errors_alone(), noise), every)
+    usual = reference_loudness(errors[R:])
+    every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
+    white = in_threads(jobs, lambda run: whitened(run, noise), every)
     first_sigma = initial_state_sigma(candidates)
     white, patches = with_patches(every, white, len(references), noise, first_sigma, jobs)
     more = patchier(patches, len(references))

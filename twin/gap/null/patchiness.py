@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.gap.null.channel_noise import ANY_SIZE
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun, whitened_columns
+from terrafusion.twin.gap.threads import in_threads
 
 FACTORS = np.append(0.0, np.geomspace(0.05, 3.0, 35))
 """1 sigma of patches that are tried, in that of `PATCH_SIGMAS`. No ground varies as much as the last: where
@@ -52,16 +52,14 @@ def with_patches(
     count = len(runs) - references
     if not references:
         return list(white), np.zeros(count)
-    with ThreadPoolExecutor(jobs) as threads:
-        parts = list(threads.map(lambda run, w: _by_window(run, w, noise), runs, white))
-        likelihood = np.array(list(threads.map(lambda own, w: _log_likelihood(own, w, sigma), parts, white)))
-        best = likelihood.argmax(axis=1)
-        factors = np.where(best < len(FACTORS) - 1, FACTORS[best], 0.0)
-        usual = FACTORS[likelihood[count:].sum(axis=0).argmax()]
-        more = np.sqrt(np.maximum(factors[:count] ** 2 - usual**2, 0.0))
-        more[factors[:count] < _limit(factors[count:])] = 0.0
-        judged = list(threads.map(_patched, white[:count], parts, more))
-    return [*judged, *white[count:]], factors
+    parts = in_threads(jobs, lambda run, w: _by_window(run, w, noise), runs, white)
+    likelihood = np.array(in_threads(jobs, lambda own, w: _log_likelihood(own, w, sigma), parts, white))
+    best = likelihood.argmax(axis=1)
+    factors = np.where(best < len(FACTORS) - 1, FACTORS[best], 0.0)
+    usual = FACTORS[likelihood[count:].sum(axis=0).argmax()]
+    more = np.sqrt(np.maximum(factors[:count] ** 2 - usual**2, 0.0))
+    more[factors[:count] < _limit(factors[count:])] = 0.0
+    return [*in_threads(jobs, _patched, white[:count], parts, more), *white[count:]], factors
 
 
 def _by_window(

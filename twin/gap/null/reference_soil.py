@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, RunResiduals, run_residuals
 from terrafusion.twin.gap.rollout.run_soil import SoilSearch, search_soil, with_run_soil
+from terrafusion.twin.gap.threads import in_threads
 
 RUNS = 3  # references that are used
 TOGETHER = (3.0, 1.0)
@@ -32,12 +32,9 @@ def all_residuals(
         done()
         return found
 
-    first = list({cache.key(log): log for log in reversed(logs)}.values())[::-1]
-    made = dict[int, RunResiduals]()
-    with ThreadPoolExecutor(jobs) as threads:
-        for part in (first, [log for log in logs if not any(log is other for other in first)]):
-            made.update(zip(map(id, part), threads.map(one, part), strict=True))
-    return [made[id(log)] for log in logs]
+    first = {cache.key(log): log for log in reversed(logs)}
+    in_threads(jobs, cache.of, reversed(first.values()))
+    return in_threads(jobs, one, logs)
 
 
 def set_soil(

@@ -8,7 +8,6 @@ noise is normal, a large error is a finding.
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     clip_outliers,
     explained_by_states,
 )
+from terrafusion.twin.gap.threads import in_threads
 
 HEAVY_TAILED = 0.02
 """A channel is clipped where more than this share (assumed) of the references' errors exceeds the limit."""
@@ -39,21 +39,21 @@ def limit_outliers(
     """
     channels = range(len(references[0].limit) if references else 0)
     every = (*runs, *references)
-    with ThreadPoolExecutor(jobs) as threads:
-        fits = threads.map(lambda run: _fit_states(run, sigma), every)
-        by_run = dict(zip(map(id, every), fits, strict=True))
+    fits, N = in_threads(jobs, lambda run: _fit_states(run, sigma), every), len(runs)
 
-    def errors(group: Sequence[WhitenedRun], channel: int) -> Array:
-        return np.abs(np.concatenate([by_run[id(run)][1][run.channel == channel] for run in group]))
+    def errors(some: slice, channel: int) -> Array:
+        group = zip(every[some], fits[some], strict=True)
+        return np.abs(np.concatenate([error[run.channel == channel] for run, (_, error) in group]))
 
-    heavy = [float(np.mean(errors(references, i) > OUTLIER_SIGMAS)) > HEAVY_TAILED for i in channels]
-    own = [NORMAL_MAD * float(np.median(errors(runs, i))) for i in channels]
+    heavy = [float(np.mean(errors(slice(N, None), i) > OUTLIER_SIGMAS)) > HEAVY_TAILED for i in channels]
+    own = [NORMAL_MAD * float(np.median(errors(slice(N), i))) for i in channels]
     normal = np.where(heavy, OUTLIER_SIGMAS, np.inf)
     changed = np.where(np.array(own) > CHANGED, own, 1.0) * normal
-    return (
-        [_clipped(run, by_run[id(run)][0], changed) for run in runs],
-        [_clipped(run, by_run[id(run)][0], normal) for run in references],
-    )
+    clipped = [
+        _clipped(run, gain, changed if i < N else normal)
+        for i, (run, (gain, _)) in enumerate(zip(every, fits, strict=True))
+    ]
+    return clipped[:N], clipped[N:]
 
 
 def _fit_states(run: WhitenedRun, sigma: Array) -> tuple[Array, Array]:

@@ -10,7 +10,6 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from threading import Lock
 from typing import Self
 
 import numpy as np
@@ -138,15 +137,11 @@ class WhitenedRun:
     def with_columns(self, columns: Array) -> Self:
         """With further whitened columns (n, D) behind those of effects and nuisance."""
         rows = np.column_stack([self.rows[:, :-1], columns.astype(np.float32), self.rows[:, -1]])
-        old, inner = self.rows.shape[1] - 1, rows.astype(float).T @ columns
-        gram = np.insert(
-            np.insert(self.gram, old, np.zeros((columns.shape[1], 1)), axis=0),
-            [old] * columns.shape[1],
-            0.0,
-            axis=1,
-        )
-        new = np.arange(old, old + columns.shape[1])
-        gram[:, new], gram[new] = inner, inner.T
+        inner, first = rows.astype(float).T @ columns, self.rows.shape[1] - 1
+        new = np.arange(first, first + columns.shape[1])
+        old = np.delete(np.arange(rows.shape[1]), new)
+        gram = np.empty((rows.shape[1],) * 2)
+        gram[np.ix_(old, old)], gram[:, new], gram[new] = self.gram, inner, inner.T
         return dataclasses.replace(self, rows=rows, gram=gram)
 
     def state_information(self, sigma: Array) -> Array:
@@ -186,7 +181,6 @@ class LinearisationCache:
     model: Model
     candidates: Candidates
     known: dict[str, Linearisation] = field(default_factory=dict)
-    lock: Lock = field(default_factory=Lock)
 
     def key(self, log: PreparedLog) -> str:
         """Hash of what logs that share a linearisation have in common."""
@@ -200,13 +194,9 @@ class LinearisationCache:
     def of(self, log: PreparedLog) -> Linearisation:
         """The linearisation of a log, from the poses of the first log with its commands."""
         key = self.key(log)
-        with self.lock:
-            known = self.known.get(key)
-        if known is None:
-            known = linearise(log, self.model, self.candidates, log.start)
-            with self.lock:
-                self.known[key] = known
-        return known
+        if key not in self.known:
+            self.known[key] = linearise(log, self.model, self.candidates, log.start)
+        return self.known[key]
 
 
 def run_residuals(log: PreparedLog, cache: LinearisationCache, channels: Sequence[str]) -> RunResiduals:

@@ -7,7 +7,6 @@ back to the model's soil linearly.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Self
 
@@ -26,6 +25,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened_error,
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
+from terrafusion.twin.gap.threads import in_threads
 
 MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's (assumed)
 LIMIT_SIGMAS = 3.0
@@ -125,19 +125,15 @@ def search_soil(
         soil = search.soil + search.step(cache.candidates)
         return with_run_soil(np.clip(soil, -limit, limit), cache, {})
 
-    with ThreadPoolExecutor(jobs) as threads:
-        for _ in range(STEPS):
-            going = [search for search in searches if search.going]
-            tried = list(threads.map(next_soil, going))
-            rollouts = [
-                Rollout(run.log, effects)
-                for search, (effects, _) in zip(going, tried, strict=True)
-                for run in search.runs
-            ]
-            found = iter(aligned_predictions(rollouts, cache.model, cache.candidates, jobs))
-            predicted = [[next(found) for _ in search.runs] for search in going]
-            soils, same = [soil for _, soil in tried], [noise] * len(going)
-            list(threads.map(SoilSearch.accept_if_better, going, soils, predicted, same))
+    for _ in range(STEPS):
+        going = [search for search in searches if search.going]
+        tried = in_threads(jobs, next_soil, going)
+        both = zip(going, tried, strict=True)
+        rollouts = [Rollout(run.log, effects) for search, (effects, _) in both for run in search.runs]
+        found = iter(aligned_predictions(rollouts, cache.model, cache.candidates, jobs))
+        predicted = [[next(found) for _ in search.runs] for search in going]
+        soils, same = [soil for _, soil in tried], [noise] * len(going)
+        in_threads(jobs, SoilSearch.accept_if_better, going, soils, predicted, same)
 
 
 def at_run_soil(
@@ -148,8 +144,7 @@ def at_run_soil(
     jobs: int = 1,
 ) -> list[RunResiduals]:
     """Runs with errors linearised about their own soil; `limit` as for `search_soil`."""
-    with ThreadPoolExecutor(jobs) as threads:
-        searches = list(threads.map(lambda run: SoilSearch.of([run], noise, ALONE), runs))
+    searches = in_threads(jobs, lambda run: SoilSearch.of([run], noise, ALONE), runs)
     search_soil(searches, cache, noise, limit, jobs)
     return [
         dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.errors[0]))

@@ -5,7 +5,6 @@ Sensitivities are finite differences of a batched rollout with one run an effect
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from terrafusion.twin.gap.rollout.batch import (
 )
 from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.ground_patches import patch_columns
+from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
 from terrafusion.twin.sensors.effects import without_delays
 
@@ -136,9 +136,8 @@ def predictions(
                 by_channel = zip(lane.log.observed, delayed_samples(lane.log, effects[i]), strict=True)
                 out[i] = [weighted_means(at, _channel(y, o.channel)) for o, at in by_channel]
 
-    with ThreadPoolExecutor(jobs) as threads:
-        logs = [rollouts[some[0]].log for some in runs]
-        list(threads.map(simulate, _batches(logs, moved, candidates, jobs)))
+    logs = [rollouts[some[0]].log for some in runs]
+    in_threads(jobs, simulate, _batches(logs, moved, candidates, jobs))
     return out
 
 
