@@ -71,11 +71,6 @@ class _Look:
     metric: Metric
     laws: Laws
 
-    def beside(self, used: Array) -> tuple[Array, list[Array]]:
-        """Gain and values of every law at its best beside others (coefficients (M + 1,))."""
-        gains, values, _ = self.laws.best(self.metric, used)
-        return gains, values
-
 
 @dataclass(frozen=True, eq=False)
 class _Explainer:
@@ -88,24 +83,29 @@ class _Explainer:
         weight = np.ones(len(self.evidence.channels)) if weight is None else weight
         return metric(runs, weight, self.sigma, self.robot)
 
-    def look(self, bank: SignatureBank) -> _Look:
-        runs = [Products.of(r, s) for r, s in zip(self.evidence.runs, bank.columns(), strict=True)]
-        m = self.metric(runs)
+    def look(
+        self, bank: SignatureBank, runs: list[Products] | None = None, weight: Array | None = None
+    ) -> _Look:
+        """At the judged runs, or at their products with further columns, with channels weighted (C,)."""
+        columns = zip(self.evidence.runs, bank.columns(), strict=True)
+        runs = [Products.of(r, s) for r, s in columns] if runs is None else runs
+        m = self.metric(runs, weight)
         return _Look(bank, runs, m, Laws.of(self.evidence.candidates, bank.ladders(), m.shared, m.none))
 
     def alone(self, look: _Look) -> dict[int, Fitted]:
         """Fits of single laws, but for those left out."""
-        left = {*self.without}
-        names = enumerate(look.laws.names)
-        allowed = [i for i, h in names if not left & {h.effect, f"{h.effect}/{h.form}"}]
-        return {i: look.laws.fit(look.metric, (i,)) for i in allowed}
+        return {
+            i: look.laws.fit(look.metric, (i,))
+            for i, h in enumerate(look.laws.names)
+            if not {*self.without} & {h.effect, f"{h.effect}/{h.form}"}
+        }
 
     def promising(self, look: _Look, alone: Mapping[int, Fitted], most: int) -> dict[int, list[float]]:
         """Laws worth a closer look, with the sizes at which to simulate them (of one size)."""
         order = sorted(alone, key=lambda i: -alone[i].evidence)
         sizes = {i: [float(alone[i].values[0][0])] for i in order[:most]}
         for i in order[:TRIED]:
-            gains, values = look.beside(alone[i].used)
+            gains, values, _ = look.laws.best(look.metric, alone[i].used)
             others = [k for k in order if look.laws.names[k].effect != look.laws.names[i].effect]
             for k in sorted(others, key=lambda k: -gains[k])[:BESIDE]:
                 sizes.setdefault(k, []).append(float(values[k][0]))
@@ -150,7 +150,7 @@ class _Explainer:
         for _ in range(ROUNDS):
             look = self.look(self.with_best_sizes(look, sizes, used))
             gains, values, used = look.laws.best(look.metric)
-            _, beside = look.beside(used[max(sizes, key=lambda i: gains[i])])
+            _, beside, _ = look.laws.best(look.metric, used[max(sizes, key=lambda i: gains[i])])
             sizes = {i: [float(v[i][0]) for v in (values, beside)[: len(s)]] for i, s in sizes.items()}
         return look, used
 
@@ -215,16 +215,15 @@ def explain(
     )
     weight, before, normal = np.ones(len(evidence.channels)), np.zeros(0), own.reference_energies()
     for _ in range(ROUNDS):
-        m = own.metric(runs, weight)
-        laws = Laws.of(evidence.candidates, look.bank.ladders(), m.shared, m.none)
-        found = CloseLook(m, laws, tuple(sizes), extra).search()
+        look = own.look(look.bank, runs, weight)
+        found = CloseLook(look.metric, look.laws, tuple(sizes), extra).search()
         top = max(found, key=lambda laws: found[laws].evidence - 5.0 * len(laws))
         before, weight = weight, own.weights(runs, found[top], weight, normal)
         if np.allclose(before, weight, rtol=0.1):
             break
     # Less what the same laws gain on references.
-    singles = {i: found[i,] for i in sizes}
-    chance = ReferenceGains.of(evidence, sigma, robot, before, laws, singles, laws.planes)
+    singles, laws = {i: found[i,] for i in sizes}, look.laws
+    chance = ReferenceGains.of(evidence, sigma, robot, before, laws, singles)
     found = {
         some: dataclasses.replace(fit, evidence=fit.evidence - chance.most(some))
         for some, fit in found.items()
@@ -237,18 +236,18 @@ def explain(
         parts = [own.metric([r for r in runs if r is not run], before) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(runs, {i: found[i,] for i in sizes})
-    return _by_effect(found, alone, laws, own.outside(m), alike, left_out)
+    alike = _same_signatures(runs, list(singles.values()))
+    return _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
 
 
-def _same_signatures(runs: Sequence[Products], fits: Mapping[int, Fitted]) -> dict[str, set[str]]:
+def _same_signatures(runs: Sequence[Products], fits: Sequence[Fitted]) -> dict[str, set[str]]:
     """By effect, those whose signatures nearly coincide with its own before the ground is fitted."""
     T, out = runs[0].states, dict[str, set[str]]()
     G = np.sum([run.gram.sum(axis=0)[T:-1, T:-1] for run in runs], axis=0)
-    used = np.array([fit.used[:-2] for fit in fits.values()])
+    used = np.array([fit.used[:-2] for fit in fits])
     inner = used @ G @ used.T
     size = np.sqrt(np.diag(inner))
-    names = [fit.laws[0].effect for fit in fits.values()]
+    names = [fit.laws[0].effect for fit in fits]
     for a, b in itertools.permutations(range(len(names)), 2):
         seen = min(size[a], size[b]) > LEAST_SIGNATURE
         if seen and names[a] != names[b] and abs(inner[a, b]) > SAME_SIGNATURE * size[a] * size[b]:

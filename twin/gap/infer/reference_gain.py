@@ -8,7 +8,7 @@ set of laws on references, at the sizes of the judged runs but with free coeffic
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -48,7 +48,6 @@ class ReferenceGains:
         weight: Array,
         laws: Laws,
         alone: Mapping[int, Fitted],
-        linear: Collection[int],
     ) -> ReferenceGains:
         """Of laws at the sizes that fit the judged runs alone. Too few references make no group.
 
@@ -64,18 +63,17 @@ class ReferenceGains:
         references = evidence.references[: GROUPS * size]
         there = dataclasses.replace(evidence, runs=references, references=[])
         soils = [run.residuals.soil for run in references]
-        at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in linear}
+        at = {i: float(fit.values[0][0]) for i, fit in alone.items() if i not in laws.planes}
         points = [SimulatedSize(laws.names[i], x, soils) for i, x in at.items() if x]
         bank = SignatureBank.empty(there).with_sizes(there, points)
         shared = references[0].by_parameter.shape[1]
-        column = {i: np.array(laws.names[i].columns) for i in alone if i in linear}
-        ladders = bank.ladders()
-        for i in at:
-            own = ladders.get(laws.names[i])
-            column[i] = shared + np.array([c for c in own.column if c >= 0] if own else [], dtype=int)
-        used = {i: np.zeros(shared + len(bank.signatures) + 2) for i in alone}
+        place = {law: shared + k for k, law in enumerate(bank.signatures)}  # each at one size
+        column, used = dict[int, Array](), dict[int, Array]()
         for i, fit in alone.items():
-            used[i][column[i]] = fit.values[0] if i in linear else 1.0
+            own = [place[laws.names[i]]] if laws.names[i] in place else []
+            column[i] = np.array(laws.names[i].columns if i in laws.planes else own, dtype=int)
+            used[i] = np.zeros(shared + len(place) + 2)
+            used[i][column[i]] = fit.values[0] if i in laws.planes else 1.0
         products, extra = products_with_discrepancy(references, evidence.model, bank, used)
         scores, looks = [score(run, sigma) for run in evidence.references], list[CloseLook]()
         for first in range(0, len(references) - size + 1, size):
