@@ -70,7 +70,7 @@ class GapDiagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """The answer as `docs/schemas/diagnosis.schema.json` has it; unknown values are null."""
-        verdict, following = self.verdict, self.next_run
+        verdict = self.verdict
         return {
             "schema": SCHEMA,
             "runs": list(self.runs),
@@ -84,31 +84,25 @@ class GapDiagnosis:
                 "significance": self.significance,
                 "uncalibrated": self.uncalibrated,
             },
-            "where": [
-                {key: getattr(c, key) for key in ("channel", "regime", "band", "share", "p_value")}
-                for c in self.where
-            ],
+            "where": [_picked(c, "channel", "regime", "band", "share", "p_value") for c in self.where],
             "verdict": verdict.kind,
             "causes": [_cause(self.evidence, c) for c in verdict.causes],
             "named": list(verdict.named),
-            "sets": [
-                {"effects": list(s.effects), "probability": s.probability, "named": s.named}
-                for s in verdict.sets
-            ],
-            "drives": None
-            if self.drives is None
-            else {"covered": self.drives.covered, "missing": list(self.drives.missing)},
+            "sets": [_picked(s, "effects", "probability", "named") for s in verdict.sets],
+            "drives": _picked(self.drives, "covered", "missing"),
             "p_unknown": verdict.p_unknown,
             "p_null": verdict.p_null,
             "shrink": _shrink(self.shrinkage),
-            "next_run": None
-            if following is None
-            else {
-                "scenario": following.scenario,
-                "separates": list(following.separates),
-                "why": following.why,
-            },
+            "next_run": _picked(self.next_run, "scenario", "separates", "why"),
         }
+
+
+def _picked(part: object, *names: str) -> Any:
+    """Some attributes by name, tuples as lists; None of nothing."""
+    if part is None:
+        return None
+    values = {name: getattr(part, name) for name in names}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def _cause(evidence: GapEvidence, cause: Cause) -> dict[str, Any]:

@@ -127,13 +127,11 @@ def _share(
         return None, None
     if before.mean() - floor <= ABOVE_FLOOR * spread / np.sqrt(len(before)):
         return None, None
-    share = float(np.clip((before.mean() - after.mean()) / (before.mean() - floor), 0.0, 1.0))
-    if len(before) < 2:
-        return share, None
-    from scipy.special import stdtrit
-
     each = (before - after) / (before.mean() - floor)
-    half = float(stdtrit(len(each) - 1, 0.975) * each.std(ddof=1) / np.sqrt(len(each)))
-    middle = float(each.mean())
-    low, high = (float(np.clip(x, 0.0, 1.0)) for x in (middle - half, middle + half))
-    return share, (low, high)
+    half = 0.0
+    if len(each) > 1:
+        from scipy.special import stdtrit
+
+        half = float(stdtrit(len(each) - 1, 0.975) * each.std(ddof=1) / np.sqrt(len(each)))
+    share, low, high = np.clip(each.mean() + half * np.array([0.0, -1.0, 1.0]), 0.0, 1.0).tolist()
+    return share, (low, high) if len(each) > 1 else None

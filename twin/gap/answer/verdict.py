@@ -188,21 +188,17 @@ def _causes(
     out = []
     for effect in sorted(weight, key=lambda effect: (-weight[effect], candidates.effects.index(effect))):
         alone = found.fits[effect,]
-        law, value, covariance = _of(found.fits[best] if effect in best else alone, effect)
+        fit = found.fits[best] if effect in best else alone
+        k = next(k for k, law in enumerate(fit.laws) if law.effect == effect)
+        columns, value = fit.laws[k].columns, fit.values[k]
         share = float(np.clip(alone.gain / max(most, 1e-9), 0.0, 1.0))
-        sigma = _sigma(candidates, law, value, covariance, head)
+        sigma = _sigma(candidates, columns, value, fit.covariance[k], head)
         members = classes.get(effect) or next(
             ((effect, *(m for m in some if m != effect)) for some in classes.values() if effect in some),
             (effect,),
         )
-        out.append(Cause(effect, members, weight[effect], law, value, sigma, share))
+        out.append(Cause(effect, members, weight[effect], columns, value, sigma, share))
     return out
-
-
-def _of(fit: Fitted, effect: str) -> tuple[tuple[int, ...], Array, Array]:
-    """Columns, values and covariance of one effect in a fit."""
-    i = next(i for i, law in enumerate(fit.laws) if law.effect == effect)
-    return fit.laws[i].columns, fit.values[i], fit.covariance[i]
 
 
 def _sigma(

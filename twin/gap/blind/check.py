@@ -7,7 +7,7 @@ scores = run_blind_check("out", diagnose, scale=QUICK)
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +68,15 @@ def run_blind_check(
         "trials_sha256": trials_sha256(),
         "methods": list(methods),
     }
-    labels = to_text(trials)
-    _commit(folder, labels, public)
+    labels, before = to_text(trials), seal.commitment(folder)
+    if before is None:
+        seal.commit(folder, labels, public)
+    elif {name: before.get(name) for name in public} != public:
+        raise ConfigError(
+            "holds a blind check of another seed or size, or of another version of the plant",
+            file=folder,
+            remedy="give another folder to --out",
+        )
     if not seal.opened(folder):
         answer_all(folder, trials, methods, pool, progress, minutes)
     seal.open_labels(folder, labels)
@@ -80,17 +87,3 @@ def run_blind_check(
     text = json.dumps(scores, indent=1, allow_nan=False)
     write_atomically(folder / RESULT, lambda part: part.write_text(text + "\n", encoding="utf-8"))
     return scores
-
-
-def _commit(folder: Path, labels: str, public: Mapping[str, Any]) -> None:
-    """Commits to the labels, unless that is done; then it must have been for the same check."""
-    before = seal.commitment(folder)
-    if before is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        seal.commit(folder, labels, public)
-    elif {name: before.get(name) for name in public} != dict(public):
-        raise ConfigError(
-            "holds a blind check of another seed or size, or of another version of the plant",
-            file=folder,
-            remedy="give another folder to --out",
-        )

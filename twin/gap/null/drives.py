@@ -73,13 +73,10 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
     words = Counter[str]()
     for cell, n in lacking.items():
         words[_words(cell)] += n
-    order = sorted(words, key=lambda name: (-words[name], name))
-    listed = [
-        f"{name} ({DT_S * words[name]:.0f} s)"
-        for name in order
-        if words[name] >= LEAST_MISSING * judged.total()
-    ]
-    return DriveCoverage(1.0 - words.total() / max(judged.total(), 1), tuple(listed[:MOST_LISTED]))
+    long = [name for name in words if words[name] >= LEAST_MISSING * judged.total()]
+    order = sorted(long, key=lambda name: (-words[name], name))[:MOST_LISTED]
+    listed = tuple(f"{name} ({DT_S * words[name]:.0f} s)" for name in order)
+    return DriveCoverage(1.0 - words.total() / max(judged.total(), 1), listed)
 
 
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:

@@ -70,10 +70,6 @@ class SoilSearch:
         white = [whitened(run.without_nuisance(), noise) for run in runs]
         return cls(white, runs[0].soil, [run.error for run in runs], [w.error for w in white], *sigmas)
 
-    def cost(self) -> float:
-        """Square of the whitened errors."""
-        return sum(float(e @ e) for e in self.white_errors)
-
     def step(self, candidates: Candidates) -> Array:
         """Step (S,) of the soil; effects and the sensor states of each run take part as nuisances."""
         S, T, K = len(self.soil), self.runs[0].states, len(candidates.keys)
@@ -98,7 +94,7 @@ class SoilSearch:
         if len(known) == len(self.runs):
             errors = [r.residuals.errors_of(values) for r, values in zip(self.runs, known, strict=True)]
             white = [whitened_error(run, noise, e) for run, e in zip(self.runs, errors, strict=True)]
-            now, before = sum(float(e @ e) for e in white), self.cost()
+            now, before = (sum(float(e @ e) for e in some) for some in (white, self.white_errors))
             if now < before:
                 self.soil, self.errors, self.white_errors = soil, errors, white
                 near = now > ENOUGH * before or now < GOOD * sum(map(len, white))
