@@ -119,8 +119,8 @@ def _stored(folder: Path, questions: Iterator[tuple[Any, ...]], pool: Pool) -> I
         # Recordings are large: no more of them at once than are worked on soon.
         workers = dataclasses.replace(found, at_once=found.at_once or 2 * pool.jobs)
         for entry in workers.results(answer, questions):
-            text = json.dumps(entry)
-            write_atomically(folder / f"{entry['trial']}.json", lambda part, text=text: part.write_text(text))
+            write = functools.partial(Path.write_text, data=json.dumps(entry))
+            write_atomically(folder / f"{entry['trial']}.json", write)
             yield entry
 
 
