@@ -54,15 +54,11 @@ class RunCells:
         order = np.lexsort(keys[::-1])
         starts = np.append(True, np.diff(keys[:, order], axis=1).any(axis=0))
         first = np.flatnonzero(starts)
-        size, of_interval, total = (
-            np.diff(np.append(first, len(order))),
-            place[order][first],
-            len(names) * len(REGIMES),
-        )
-        weights = (np.ones(len(size)), size - 1.0)
-        count = np.stack([np.bincount(of_interval, weight, total) for weight in weights], axis=1).ravel()
-        samples: Array = np.repeat(np.bincount(of_interval, size, total), len(BANDS)).astype(float)
-        return cls(order, first, size, of_interval, count.astype(float), samples)
+        size, of_interval = np.diff(np.append(first, len(order))), place[order][first]
+        total, one = len(names) * len(REGIMES), np.ones(len(size))
+        intervals, samples = (np.bincount(of_interval, weight, total) for weight in (one, size))
+        count = np.stack([intervals, samples - intervals], axis=1).ravel()
+        return cls(order, first, size, of_interval, count, np.repeat(samples, len(BANDS)))
 
     def squares(self, errors: Array) -> Array:
         """Sums of squares (K, N) of errors (n, N): of the means of all intervals, and about them."""

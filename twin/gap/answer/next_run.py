@@ -100,23 +100,25 @@ class Planner:
         def sigmas(name: str, repeats: int = 1) -> float:
             return self.separation(one, other, repeats * found[name])
 
-        best = max(found, key=sigmas)
-        pair = (one.effect, other.effect)
-        enough = (n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS)
-        repeats = next(enough, None)
-        if repeats is None:
+        best, pair = max(found, key=sigmas), (one.effect, other.effect)
+        scenario, apart = best, f"{sigmas(best):.1f} sigma"
+        enough = [n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS]
+        if enough:
+            mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
+            load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" * (PAYLOAD in best)
             why = (
-                f"none of the drives tried separates {pair[0]} from {pair[1]} (the best, '{best}', by "
-                f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
+                f"of {len(drives())} drives simulated, this one separates {pair[0]} from {pair[1]} best: by "
+                f"{apart}, together with these runs; drive it {times(enough[0])}{load}"
             )
-            return NextRun(BY_HAND, pair, sigmas(best), why)
-        mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
-        load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
-        why = (
-            f"of {len(drives())} drives simulated, this one separates {pair[0]} from {pair[1]} best: by "
-            f"{sigmas(best):.1f} sigma, together with these runs; drive it {times(repeats)}{load}"
-        )
-        return NextRun(best, pair, sigmas(best), why)
+        else:
+            scenario, why = (
+                BY_HAND,
+                (
+                    f"none of the drives tried separates {pair[0]} from {pair[1]} (the best, '{best}', by "
+                    f"{apart} in the twin): measure one of the two directly"
+                ),
+            )
+        return NextRun(scenario, pair, sigmas(best), why)
 
     def separation(self, one: Cause, other: Cause, more: Array | float = 0.0) -> float:
         """Sigmas by which runs separate two causes, whichever is true.
@@ -125,9 +127,7 @@ class Planner:
             more: (P, P) information of further runs, from `forecast`.
         """
         every = marginalise_robot_offsets(self.known + more, self.robot)
-        return min(
-            self._remaining_sigmas(every, one, other.effect), self._remaining_sigmas(every, other, one.effect)
-        )
+        return min(self._remaining_sigmas(every, a, b.effect) for a, b in ((one, other), (other, one)))
 
     def _remaining_sigmas(self, information: Array, true: Cause, other: str) -> float:
         """Sigmas that remain of the true cause once any form of the other is fitted to it."""

@@ -84,14 +84,9 @@ class _Fit:
         cost = self._cost(x, logs)
         for _ in range(STEPS):
             goal, information = self._step(x, logs)
-            trials = [x + share * (goal - x) for share in SHARES]
-            found = ((self._cost(trial, logs), trial) for trial in trials)
-            better = next(((c, trial) for c, trial in found if c < cost), None)
-            if better is None:
-                break
-            done = better[0] > (1.0 - ENOUGH) * cost
-            cost, x = better
-            if done:
+            trials = ((self._cost(y, logs), y) for y in (x + share * (goal - x) for share in SHARES))
+            before, (cost, x) = cost, next((found for found in trials if found[0] < cost), (cost, x))
+            if cost > (1.0 - ENOUGH) * before:
                 break
         return x, information
 
