@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.gap.blind.rates import Rate
-from terrafusion.twin.gap.diagnose import diagnose
+from terrafusion.twin.gap.blind.rates import rate
+from terrafusion.twin.gap.diagnose import SIGNIFICANCE, diagnose
 from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import RouteLeg, Scenario
@@ -57,12 +57,13 @@ def judged(trial: tuple[int, str]) -> dict[str, Any]:
     runs = [run(500 + i, SITES[site]) for i in range(RUNS)]
     answer = diagnose(runs, references, load_vehicle(robot), soil, jobs=1).to_json()
     return {key: answer["gap"][key] for key in ("detected", "p_value")} | {
-        "where": f"{robot}, {soil}, {kind}"
+        "where": f"{robot}, {soil}, {kind}",
+        "place": min(cell["p_value"] for cell in answer["where"]),
     }
 
 
 def main() -> int:
-    """Print a line a trial, then false alarms by site with their intervals."""
+    """Print a line a trial, then false alarms and false places by site with their intervals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=8, help="of each site")
     parser.add_argument("--out", type=Path, help="folder for parts; the same command continues")
@@ -71,11 +72,13 @@ def main() -> int:
     wanted = [(number, site) for number in range(given.trials) for site in SITES]
     found = dict(zip(wanted, answers(wanted, judged, TaskWorkers.of(given), given.out), strict=True))
     for (_, site), one in found.items():
-        print(f"{one['where']:28s} ground {site:20s} p {one['p_value']:.2g}")
+        print(f"{one['where']:28s} ground {site:20s} p {one['p_value']:.2g}, of a place {one['place']:.2g}")
     for site in SITES:
-        alarms = [one["detected"] for (_, own), one in found.items() if own == site]
-        low, high = Rate(sum(alarms), len(alarms)).interval()
-        print(f"false alarms, ground {site}: {sum(alarms)} of {len(alarms)} ({low:.2f} to {high:.2f})")
+        some = [one for (_, own), one in found.items() if own == site]
+        places = rate([one["place"] <= SIGNIFICANCE for one in some])
+        for name, share in (("alarms", rate([one["detected"] for one in some])), ("places", places)):
+            low, high = share.interval()
+            print(f"false {name}, ground {site}: {share.hits} of {share.count} ({low:.2f} to {high:.2f})")
     return 0
 
 
