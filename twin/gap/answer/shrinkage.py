@@ -49,12 +49,6 @@ class Shrinkage:
     errors_before: list[Array]
 
 
-def without_states(run: WhitenedRun, sigma: Array, error: Array) -> Array:
-    """An error (n,) with the best theta of its prior subtracted."""
-    J = run.by_state
-    return error - J @ np.linalg.solve(run.state_information(sigma), J.T @ error)
-
-
 def own_error(run: WhitenedRun, robot: RobotOffsets) -> Array:
     """The run's whitened error (n,) less what is common to the references."""
     return run.error - run.by_parameter @ robot.mean
@@ -65,23 +59,24 @@ def shrinkage(evidence: GapEvidence, sigma: Array, robot: RobotOffsets, fit: Eff
     runs, references = evidence.runs, evidence.references
     was = [own_error(run, robot) for run in runs]
     now = _errors_left_out(evidence, robot, fit, was)
-    free = [_mean_square(without_states(r, FREE * sigma, e)) for r, e in zip(runs, was, strict=True)]
-    arms = [[without_states(r, sigma, e) for r, e in zip(runs, errors, strict=True)] for errors in (was, now)]
-    floors = [without_states(r, sigma, own_error(r, robot)) for r in references]
-    before, after = ([_mean_square(error) for error in arm] for arm in arms)
-    squares = [_mean_square(error) for error in floors]
-    floor = float(np.mean(squares)) if squares else None
-    spread = float(np.std(squares, ddof=1)) if len(squares) > 1 else None
-    share, interval = _share(np.array(before), np.array(after), floor, spread)
-    least = min(floor, float(np.mean(before))) if floor is not None else 0.0
-    physical = [
-        [physical_error(r, evidence.noise, e) for r, e in zip(some, errors, strict=True)]
-        for some, errors in ((runs, arms[0]), (runs, arms[1]), (references, floors))
+    free = [_mean_square(r.without_states(FREE * sigma, e)) for r, e in zip(runs, was, strict=True)]
+    arms = [
+        [(r, r.without_states(sigma, e)) for r, e in zip(some, errors, strict=True)]
+        for some, errors in (
+            (runs, was),
+            (runs, now),
+            (references, [own_error(r, robot) for r in references]),
+        )
     ]
+    before, after, floors = (np.array([_mean_square(error) for _, error in arm]) for arm in arms)
+    floor = float(floors.mean()) if len(floors) else None
+    spread = float(floors.std(ddof=1)) if len(floors) > 1 else None
+    share, interval = _share(before, after, floor, spread)
+    least = min(floor, float(before.mean())) if floor is not None else 0.0
+    physical = [[(r, physical_error(r, evidence.noise, e)) for r, e in arm] for arm in arms]
     return Shrinkage(
-        float(np.mean(before)), max(float(np.mean(after)), least), floor, share, interval,
-        float(np.mean(free)), _by_channel(evidence, arms[0], arms[1], floors),
-        _by_channel(evidence, physical[0], physical[1], physical[2]), now, was,
+        float(before.mean()), max(float(after.mean()), least), floor, share, interval, float(np.mean(free)),
+        _by_channel(evidence, arms), _by_channel(evidence, physical), now, was,
     )  # fmt: skip
 
 
@@ -90,22 +85,20 @@ def _mean_square(error: Array) -> float:
 
 
 def _by_channel(
-    evidence: GapEvidence, before: Sequence[Array], after: Sequence[Array], floors: Sequence[Array]
+    evidence: GapEvidence, arms: Sequence[Sequence[tuple[WhitenedRun, Array]]]
 ) -> dict[str, tuple[float, float, float | None]]:
     """Root mean squares of errors of the judged runs, before and after, and of the references."""
-    out = {}
-    for name in dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels):
-        mine = [i for i, c in enumerate(evidence.channels) if CHANNEL_NAMES[c] == name]
-        first, second = (_rms(evidence.runs, errors, mine) or 0.0 for errors in (before, after))
-        out[name] = (first, second, _rms(evidence.references, floors, mine))
-    return out
+    names = np.array([CHANNEL_NAMES[c] for c in evidence.channels])
 
+    def rms(arm: Sequence[tuple[WhitenedRun, Array]], name: str) -> float:
+        joined = np.concatenate([error[names[run.channel] == name] for run, error in arm])
+        return float(np.sqrt(np.mean(joined**2)))
 
-def _rms(runs: Sequence[WhitenedRun], errors: Sequence[Array], channels: Sequence[int]) -> float | None:
-    """Root mean square of the errors in some channels of all runs."""
-    parts = [e[np.isin(r.channel, channels)] for r, e in zip(runs, errors, strict=True)]
-    joined = np.concatenate(parts) if parts else np.zeros(0)
-    return float(np.sqrt(np.mean(joined**2))) if len(joined) else None
+    before, after, normal = arms
+    return {
+        name: (rms(before, name), rms(after, name), rms(normal, name) if normal else None)
+        for name in dict.fromkeys(names.tolist())
+    }
 
 
 def _errors_left_out(

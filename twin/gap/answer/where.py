@@ -15,7 +15,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.answer.cells import BANDS, REGIMES, RunCells
-from terrafusion.twin.gap.answer.shrinkage import own_error, without_states
+from terrafusion.twin.gap.answer.shrinkage import own_error
 from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.gap.infer.detection import drawn_robots, drawn_scatter
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
@@ -68,7 +68,7 @@ def gap_map(
         return []
     names = list(dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels))
     cells = [RunCells.of(run, evidence.model, names) for run in runs]
-    errors = [without_states(run, sigma, own_error(run, robot)) for run in runs]
+    errors = [run.without_states(sigma, own_error(run, robot)) for run in runs]
     square = np.array([c.squares(e[:, None])[:, 0] for c, e in zip(cells, errors, strict=True)])
     count, samples = np.array([c.count for c in cells]), np.array([c.samples for c in cells])
     kept = np.flatnonzero((count[:R].min(axis=0) >= 1.0) & (count.sum(axis=0) >= LEAST_SAMPLES))
@@ -142,4 +142,4 @@ def _p_values(
 def _moved(run: WhitenedRun, cells: RunCells, offsets: Array, sigma: Array) -> Array:
     """Mean squares (N, cells) of what offsets (N, P) do to a run."""
     moved = run.rows[:, run.states : -1] @ offsets.T.astype(np.float32)
-    return cells.squares(without_states(run, sigma, moved.astype(float))).T / (cells.count + 1.0)
+    return cells.squares(run.without_states(sigma, moved.astype(float))).T / (cells.count + 1.0)

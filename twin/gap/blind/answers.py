@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.recording import Recording
@@ -22,14 +22,8 @@ DIAGNOSIS, OPPONENT = "diagnosis", "opponent"
 LANES = 160  # runs of the plant in one batch (about 5 MB each)
 
 
-class Answer(Protocol):
-    """Result of a diagnosis."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Keeps to `diagnosis.schema.json`."""
-
-
-Diagnose = Callable[..., Answer]  # diagnose(runs, references, vehicle, *, seed) -> Answer
+Diagnose = Callable[..., Any]
+"""diagnose(runs, references, vehicle, *, seed): its `to_json` keeps to `diagnosis.schema.json`."""
 
 
 @dataclass(frozen=True)

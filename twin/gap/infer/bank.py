@@ -32,17 +32,9 @@ THRESHOLDS = (0.4, 0.7, 1.0)
 """Sizes of an insensitive law, in that of its range: it acts beyond a threshold, if at all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Ladder:
-    """The sizes of one law.
-
-    Attributes:
-        at: (N,) sizes, ascending, zero among them: the value of each of its parameters, in typical sizes.
-        column: (N,) index of each one's signature in `SignatureBank.columns`; -1 for zero.
-    """
-
-    at: Array
-    column: tuple[int, ...]
+Ladder = tuple[Array, tuple[int, ...]]
+"""Sizes (N,) of one law, ascending, zero among them: the value of each of its parameters, in typical sizes;
+and the index of each one's signature in `SignatureBank.columns`, -1 for zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +98,8 @@ class SignatureBank:
 
     def ladders(self) -> dict[Hypothesis, Ladder]:
         """By law."""
-        count = itertools.count()
-        return {
-            law: Ladder(at, tuple(next(count) if size else -1 for size in at))
-            for law, at in ((law, self.sizes(law)) for law in self.signatures)
-        }
+        count, sizes = itertools.count(), {law: self.sizes(law) for law in self.signatures}
+        return {law: (at, tuple(next(count) if size else -1 for size in at)) for law, at in sizes.items()}
 
     def columns(self) -> list[Array]:
         """(n, Q) signatures of each run, in the order of the ladders."""

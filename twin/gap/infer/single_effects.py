@@ -72,18 +72,14 @@ class Laws:
         planes = dict[int, tuple[NDArray[np.int64], Array, Array]]()
         for i, h in enumerate(candidates.hypotheses):
             if h in ladders:
-                at = [none if c < 0 else shared + c for c in ladders[h].column]
-                for pair, sizes in zip(
-                    itertools.pairwise(at), itertools.pairwise(ladders[h].at), strict=True
-                ):
-                    law.append(i)
-                    column.append(pair)
-                    size.append(sizes)
+                at, signatures = ladders[h]
+                size += itertools.pairwise(at)
+                column += itertools.pairwise(none if c < 0 else shared + c for c in signatures)
+                law += [i] * (len(at) - 1)
             elif not is_simulated(h, candidates):
                 planes[i] = (np.array(h.columns), *candidates.bounds(h.columns))
-        columns = np.array(column, dtype=np.int64).reshape(-1, 2)
-        sizes_ = np.array(size, dtype=float).reshape(-1, 2)
-        return cls(candidates, candidates.hypotheses, np.array(law, dtype=np.int64), columns, sizes_, planes)
+        columns, sizes = np.array(column, dtype=int).reshape(-1, 2), np.array(size).reshape(-1, 2)
+        return cls(candidates, candidates.hypotheses, np.array(law, dtype=int), columns, sizes, planes)
 
     def only(self, i: int) -> Laws:
         """One law."""

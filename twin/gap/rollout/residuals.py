@@ -148,6 +148,11 @@ class WhitenedRun:
         """(T, T) information of the states with their prior of 1 sigma (T,)."""
         return self.gram[: self.states, : self.states] + np.diag(sigma**-2.0)
 
+    def without_states(self, sigma: Array, error: Array) -> Array:
+        """An error (n,) or several (n, k) with the best states of that prior subtracted."""
+        J = self.by_state
+        return np.asarray(error - J @ np.linalg.solve(self.state_information(sigma), J.T @ error))
+
     def without_poses(self, error: Array) -> Array:
         """A whitened error (n,) with the poses projected out."""
         return _less(error, self.pose_basis, self.window)

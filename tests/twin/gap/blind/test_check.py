@@ -101,11 +101,11 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_answer(
 ) -> None:
     whole = Path.write_text
 
-    def full(path: Path, text: str, **more: Any) -> int:
+    def full(path: Path, data: str, **more: Any) -> int:
         if path.name.startswith(".trial-0002"):
-            whole(path, text[:5])
+            whole(path, data[:5])
             raise OSError(errno.ENOSPC, "No space left on device")
-        return whole(path, text, **more)
+        return whole(path, data, **more)
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(DataError, match=r"cannot be written: No space left"):

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.infer.bank import Ladder
 from terrafusion.twin.gap.infer.predictive import Metric
 from terrafusion.twin.gap.infer.single_effects import RIDGE, Laws
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "encoder_dropout"])
 ROWS, SIZE = 300, 4.0
 LADDERS = {
-    law: Ladder(np.array([0.0, 1.0, 3.0]), (-1, 0, 1))
+    law: (np.array([0.0, 1.0, 3.0]), (-1, 0, 1))
     for law in CANDIDATES.hypotheses
     if (law.effect, law.form) == ("encoder_scale", "in_loop")
 }
@@ -79,7 +78,7 @@ def test_an_effect_of_one_side_is_not_believed_on_the_other() -> None:
     mine = CANDIDATES.keys.index("encoder_dropout/share")
     assert CANDIDATES.low[mine] == 0.0
     for sign, believed in ((1.0, True), (-1.0, False)):
-        ladder = Ladder(np.array([0.0, 1.0, 3.0]), (-1, 0, 1))
+        ladder = (np.array([0.0, 1.0, 3.0]), (-1, 0, 1))
         own = columns[:, mine]
         X = np.column_stack([columns, own, 3.0 * own, sign * own + noise(3)])
         m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
@@ -185,7 +184,7 @@ def test_a_simulated_law_of_two_columns_has_one_size() -> None:
     columns, signatures = np.random.default_rng(2).standard_normal((2, ROWS, len(candidates.keys)))
     X = np.column_stack([columns, signatures[:, :2], 2.0 * signatures[:, 0]])
     m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
-    ladders = {both: Ladder(np.array([0.0, 1.0, 3.0]), (-1, 0, 1))}
+    ladders = {both: (np.array([0.0, 1.0, 3.0]), (-1, 0, 1))}
     laws = Laws.of(candidates, ladders, m.shared, m.none)
     fit = laws.fit(m, (0,))
     assert fit.values[0].shape == (2,)
