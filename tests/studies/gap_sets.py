@@ -35,6 +35,7 @@ from terrafusion.twin.gap.answer.verdict import (
 )
 from terrafusion.twin.gap.blind.rates import Rate, Reliability, reliability
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.threads import one_blas_thread
 from terrafusion.twin.gap.infer.calibration import Head, calibration_head, probabilities
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import Explanation, explain
@@ -44,7 +45,6 @@ from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
-from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.sensors.effects import DELAYS

@@ -18,6 +18,7 @@ from terrafusion.twin.gap.answer.verdict import judge
 from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import check_distinct
+from terrafusion.twin.gap.data.threads import one_blas_thread
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
@@ -27,7 +28,6 @@ from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.gap.null.score import learn_state_sigma, replicates, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
-from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import VehicleParams
 
 SIGNIFICANCE = 0.05

@@ -23,6 +23,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.infer.law_misfit import GROUND
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import marginalise_robot_offsets, marginalise_run_offsets
@@ -30,7 +31,6 @@ from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
-from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.file import scenario_of

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import whitened_error
 from terrafusion.twin.gap.rollout.run_soil import referred_to_model, with_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
-from terrafusion.twin.gap.threads import in_threads
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, sheet_correlation
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import Indices, sample_map
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.residuals import (
     RunResiduals,
     initial_state_sigma,
@@ -17,7 +18,6 @@ from terrafusion.twin.gap.rollout.residuals import (
     physical_error,
     whitened,
 )
-from terrafusion.twin.gap.threads import in_threads
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 

@@ -13,6 +13,7 @@ from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import digest, prepared
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
@@ -27,7 +28,6 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.run_soil import at_run_soil, soil_limit
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
-from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.model.vehicle import VehicleParams
 
 

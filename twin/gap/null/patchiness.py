@@ -16,9 +16,9 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.samples import Indices
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import ANY_SIZE
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun, whitened_columns
-from terrafusion.twin.gap.threads import in_threads
 
 FACTORS = np.append(0.0, np.geomspace(0.05, 3.0, 35))
 """1 sigma of patches that are tried, in that of `PATCH_SIGMAS`. No ground varies as much as the last: where

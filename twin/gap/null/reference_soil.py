@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, RunResiduals, run_residuals
 from terrafusion.twin.gap.rollout.run_soil import SoilSearch, search_soil, with_run_soil
-from terrafusion.twin.gap.threads import in_threads
 
 RUNS = 3  # references that are used
 TOGETHER = (3.0, 1.0)

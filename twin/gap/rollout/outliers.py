@@ -12,13 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.residuals import (
     OUTLIER_SIGMAS,
     WhitenedRun,
     clip_outliers,
     explained_by_states,
 )
-from terrafusion.twin.gap.threads import in_threads
 
 HEAVY_TAILED = 0.02
 """A channel is clipped where more than this share (assumed) of the references' errors exceeds the limit."""

@@ -15,6 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, Candidates
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.residuals import (
     SOIL_SIGMAS,
     LinearisationCache,
@@ -25,7 +26,6 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened_error,
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
-from terrafusion.twin.gap.threads import in_threads
 
 MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's (assumed)
 LIMIT_SIGMAS = 3.0

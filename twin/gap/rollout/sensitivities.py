@@ -21,6 +21,7 @@ from terrafusion.twin.gap.data.samples import (
     sample_map,
     weighted_means,
 )
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.batch import (
     GROUP_SIZE,
     NOMINAL,
@@ -34,7 +35,6 @@ from terrafusion.twin.gap.rollout.batch import (
 )
 from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.ground_patches import patch_columns
-from terrafusion.twin.gap.threads import in_threads
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
 from terrafusion.twin.sensors.effects import without_delays
 
