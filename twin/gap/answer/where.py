@@ -3,10 +3,12 @@ references.
 
 A cell's share is its part of the excess of squared errors. Its p-value holds for all cells together: the
 greatest standardised excess over all cells, among replicates of the judged drives (max-T, Westfall and Young
-1993). In a replicate the mean square of a cell scatters as the references' does. It is larger, never smaller,
-by what is unknown of the robot there, and by how much more its scatter shows than on their drives.
+1993). In a replicate the mean square of a cell scatters as that of references does, each judged by what the
+others show of the robot. It is larger, never smaller, by how much more its scatter and what is unknown of the
+robot show than on their drives.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,20 +17,20 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.answer.cells import BANDS, REGIMES, RunCells
-from terrafusion.twin.gap.answer.shrinkage import own_error
 from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.gap.infer.detection import drawn_robots, drawn_scatter
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.loud_noise import LOUD
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 LEAST_SAMPLES = 5  # effective, of all runs together, from which a cell is listed (assumed)
-REPLICATES = 299  # of the judged drives
+REPLICATES, ROBOTS = 3999, 200  # of the judged drives, and robots drawn for these
 LEAST_REFERENCES = 2  # fewer have no scatter from run to run
-SPREAD_RUNS = 2.0  # weight, in runs, of the variance that the cells of a band have on average (assumed)
-SCATTER_RUNS, SCATTER_DRAWS = 3, 20  # references, and draws each, that show the squares due to scatter
+SPREAD_RUNS = 8.0  # weight, in runs, of the variance that the cells of a band have on average (assumed)
+SCATTER_RUNS, SCATTER_DRAWS = 3, 20  # references, and draws each, that show the squares due to both
 LEAST_NOISE = 0.25  # least share of the references' mean squares that is noise (assumed)
 UNSEEN = math.log(LOUD)
 """1 sigma of the log mean square in a regime that no reference drove: up to so much louder, no noise is taken
@@ -68,7 +70,7 @@ def gap_map(
         return []
     names = list(dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels))
     cells = [RunCells.of(run, evidence.model, names) for run in runs]
-    errors = [run.without_states(sigma, own_error(run, robot)) for run in runs]
+    errors = out_of_sample(evidence.runs, evidence.references, sigma, robot)
     square = np.array([c.squares(e[:, None])[:, 0] for c, e in zip(cells, errors, strict=True)])
     count, samples = np.array([c.count for c in cells]), np.array([c.samples for c in cells])
     kept = np.flatnonzero((count[:R].min(axis=0) >= 1.0) & (count.sum(axis=0) >= LEAST_SAMPLES))
@@ -94,6 +96,15 @@ def gap_map(
         for place, regime, band in [np.unravel_index(i, (len(names), len(REGIMES), len(BANDS)))]
     ]  # fmt: skip
     return sorted(found, key=lambda c: (c.p_value > significance, -c.share, c.channel, c.regime, c.band))
+
+
+def out_of_sample(
+    runs: Sequence[WhitenedRun], references: Sequence[WhitenedRun], sigma: Array, robot: RobotOffsets
+) -> list[Array]:
+    """Errors (n,) of judged runs and references less states and offsets, those that the other runs show."""
+    means = [robot.mean] * len(runs) + robot.left_out([score(run, sigma) for run in references])
+    every = zip([*runs, *references], means, strict=True)
+    return [run.without_states(sigma, run.error - run.by_parameter @ mean) for run, mean in every]
 
 
 def _p_values(
@@ -124,14 +135,18 @@ def _p_values(
         every = zip(runs, of, draws, strict=True)
         return [_moved(run, own, d, sigma)[:, kept].mean(axis=0) for run, own, d in every]
 
-    some = slice(SCATTER_RUNS)
+    some, there = slice(SCATTER_RUNS), dataclasses.replace(robot, covariance=robot.known(), changed=0.0)
     usual = np.mean(scattered(evidence.references[some], cells[J:][some]), axis=0)
+    offsets = drawn_robots(there, SCATTER_DRAWS, rng)
+    for run, of in zip(evidence.references[some], cells[J:][some], strict=True):
+        usual += _moved(run, of, offsets, sigma)[:, kept].mean(axis=0) / len(evidence.references[some])
     noise = np.maximum(np.exp(normal) - usual, LEAST_NOISE * np.exp(normal))
-    offsets, scatter = drawn_robots(robot, REPLICATES, rng), scattered(evidence.runs, cells[:J])
+    offsets, scatter = drawn_robots(robot, ROBOTS, rng), scattered(evidence.runs, cells[:J])
+    which = rng.integers(ROBOTS, size=REPLICATES)
     for run, of, own in zip(evidence.runs, cells[:J], scatter, strict=True):
         unknown = _moved(run, of, offsets, sigma)[:, kept]
         larger = np.log((noise + np.maximum(own + unknown, usual)) / (noise + usual))
-        drawn += (larger + unseen + sd * rng.standard_normal(size)) / J
+        drawn += (larger[which] + unseen + sd * rng.standard_normal(size)) / J
     excess = log[:J].mean(axis=0) - normal
     middle, high = np.quantile(drawn, [0.5, 0.95], axis=0)
     least = (excess - middle) / (high - middle)

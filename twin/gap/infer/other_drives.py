@@ -69,6 +69,15 @@ class RobotOffsets:
         mean, covariance, _ = _posterior(references, self.scatter, self.prior)
         return RobotOffsets(mean, covariance, self.scatter, self.prior, len(references), self.misfit)
 
+    def left_out(self, references: Sequence[Score]) -> list[Array]:
+        """Mean (P,) by all the references but each, with the same scatter and prior."""
+        own, parts = 1.0 / self.scatter, list[tuple[Array, Array]]()
+        for r in references:
+            H = inverse(r.A + np.diag(own))
+            parts.append((np.diag(own) - own[:, None] * H * own, own * (H @ r.b)))
+        known, gain = np.diag(1.0 / self.prior) + sum(k for k, _ in parts), sum(g for _, g in parts)
+        return [np.linalg.solve(known - k, gain - g) for k, g in parts]
+
 
 def learn_offsets(
     references: Sequence[Score], candidates: int, scales: Sequence[float] = SCATTER_SCALES

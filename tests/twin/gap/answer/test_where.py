@@ -10,7 +10,6 @@ import pytest
 
 from terrafusion.twin.gap.answer import cells, where
 from terrafusion.twin.gap.answer.cells import REGIMES, SLOW_S, RunCells
-from terrafusion.twin.gap.answer.shrinkage import own_error
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null.score import Score
@@ -69,8 +68,8 @@ def p_values(
     offsets = learn_offsets(scores, 4)
     evidence: Any = SimpleNamespace(runs=every[:1], references=every[1:])
     of = [RunCells.of(r, evidence, NAMES) for r in every]
-    errors = [r.without_states(SIGMA, own_error(r, offsets))[:, None] for r in every]
-    square = np.array([c.squares(e)[:, 0] for c, e in zip(of, errors, strict=True)])
+    errors = where.out_of_sample(every[:1], every[1:], SIGMA, offsets)
+    square = np.array([c.squares(e[:, None])[:, 0] for c, e in zip(of, errors, strict=True)])
     kept = np.flatnonzero(of[0].count >= 1.0)
     assert len(kept) in (8, 24)
     return where._p_values(evidence, SIGMA, offsets, of, square, kept, rng)
