@@ -76,7 +76,7 @@ class RobotOffsets:
             H = inverse(r.A + np.diag(own))
             parts.append((np.diag(own) - own[:, None] * H * own, own * (H @ r.b)))
         known, gain = np.diag(1.0 / self.prior) + sum(k for k, _ in parts), sum(g for _, g in parts)
-        return [np.linalg.solve(known - k, gain - g) for k, g in parts]
+        return [np.asarray(np.linalg.solve(known - k, gain - g)) for k, g in parts]
 
 
 def learn_offsets(
