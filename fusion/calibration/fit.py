@@ -33,7 +33,8 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
     found = dataclasses.replace(now, mean=now.mean + covariance @ right, covariance=covariance).outwards()
     moments = [one.apply(found.mean - now.mean, found.mean) for one in reduced]
     spread, time_s = slip_process(moments, before.slip_spread, before.slip_time_s)
-    return dataclasses.replace(found, slip_spread=spread, slip_time_s=time_s)
+    misfit = max(one.misfit for one in reduced)
+    return dataclasses.replace(found, slip_spread=spread, slip_time_s=time_s, misfit=misfit)
 
 
 def started(drive: MotionSegment, start: complex, yaw_rad: float, numbers: Array) -> Nodes:

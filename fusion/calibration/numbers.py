@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,12 +69,14 @@ class Knowledge:
         covariance: (8, 8).
         slip_spread: standard deviation of the distance ratio about `wheel_scale`.
         slip_time_s: correlation time of that ratio.
+        misfit: variance of the fixes' residuals over that of their white noise; at least 1.
     """
 
     mean: Array
     covariance: Array
     slip_spread: float
     slip_time_s: float
+    misfit: float = 1.0
 
     @property
     def sigma(self) -> Array:
@@ -92,15 +96,26 @@ class Knowledge:
         without[COURSE_LAG, COURSE_LAG] = NO_LAG_SIGMA_S**2
         return dataclasses.replace(self, mean=self.mean - gain * lag_s, covariance=without)
 
+    def given(self, rows: Sequence[int], held: Sequence[int], before: Knowledge) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) of the numbers `rows` if those `held` are as `before`."""
+        covariance = self.covariance
+        gain = covariance[np.ix_(rows, held)] @ np.linalg.pinv(covariance[np.ix_(held, held)])
+        mean = self.mean[rows] - gain @ (self.mean - before.mean)[held]
+        return mean, covariance[np.ix_(rows, rows)] - gain @ covariance[np.ix_(held, rows)]
+
     def with_covariance(self, covariance: Array, wide: Knowledge) -> Knowledge:
         """With another covariance (8, 8), scaled so that no number is known less well than in `wide`."""
         limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
         shrink = np.sqrt(limit / np.diag(covariance))
         return dataclasses.replace(self, covariance=covariance * np.outer(shrink, shrink))
 
-    def stated_sigma(self, before: Knowledge) -> Array:
-        """1 sigma (8,) with what slip imitates; at most that `before` the drive."""
-        return np.asarray(np.minimum(np.hypot(self.sigma, IMITATED), before.sigma))
+    def stated_sigma(self, before: Knowledge, misfit: float = 1.0) -> Array:
+        """1 sigma (8,) with what slip imitates; at most that `before` the drive.
+
+        That grows with the `misfit`: what slip leaves of the fixes' residuals is a measure of the rest.
+        """
+        imitated = math.sqrt(misfit) * IMITATED
+        return np.asarray(np.minimum(np.hypot(self.sigma, imitated), before.sigma))
 
 
 def assumed(

@@ -34,14 +34,12 @@ class SelfCalibration:
         prior: what was known before the first drive.
         known: the numbers by now.
         before: the numbers when the stretch under way began.
-        misfit: variance of the fixes' residuals at the last step over that of their noise.
         usual_sigma_m: median 1 sigma of the newest fixes.
         turned_rad: turns of the stretch under way, of either sign.
     """
 
     def __init__(self, prior: Knowledge, noise: Noise, antenna_m: complex) -> None:
         self.prior = self.known = self.before = prior
-        self.misfit = 1.0
         self._noise, self._antenna_m = noise, antenna_m
         self._begin()
 
@@ -141,7 +139,7 @@ class SelfCalibration:
             self.known = self.before
             self._begin()
             return False
-        self._state, self.known, self.misfit = work.part.state, found, work.misfit
+        self._state, self.known = work.part.state, found
         self._far = FAR_MISFIT < work.misfit < BETTER * self._step_misfit
         self._step_misfit = work.misfit
         if len(self._state) >= MOST_NODES:

@@ -37,6 +37,10 @@ class AntennaPlaces:
         """Lever arms (N, 3) at the times (N,)."""
         return np.array(self.lever_m, dtype=float)[self._rows(t_ns)]
 
+    def used(self, t_ns: TimesNs) -> tuple[Array, Array]:
+        """Lever arms (N, 3), m, and delays (N,), s, in use at the times (N,)."""
+        return self.at(t_ns), np.array(self.late_ns)[self._rows(t_ns)] * 1e-9
+
     def measured_ns(self, stamp_ns: TimesNs) -> TimesNs:
         """When fixes with the stamps (N,) were measured."""
         return stamp_ns - np.array(self.late_ns, dtype=np.int64)[self._rows(stamp_ns)]

@@ -10,7 +10,6 @@ state = est.latest()
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -38,10 +37,11 @@ from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
+from terrafusion.fusion.estimator.place_doubt import PlaceDoubt
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
-from terrafusion.fusion.estimator.stationarity import StationarityDetector, add_zero_velocity
+from terrafusion.fusion.estimator.stationarity import StationarityDetector
 from terrafusion.fusion.estimator.steering import policy_of, steered_turn
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
@@ -124,6 +124,7 @@ class Estimator:
         self._fresh: tuple[State, float, float | None, Array, Array] | None = None  # and the motion to it
         self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
+        self._place_doubt = PlaceDoubt()
         self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
 
     @classmethod
@@ -228,7 +229,7 @@ class Estimator:
         """
         if self._state is None:
             return None
-        now = self._propagator.carry(self._state, self._covariance, self.imu, self.weights.noise)
+        now = self._propagator.carry(self._state, self._reported_covariance, self.imu, self.weights.noise)
         return now if in_map(frame) else self._frame.of(self._state, now)
 
     def dump(self) -> bytes:
@@ -342,7 +343,8 @@ class Estimator:
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
             self.chain.add(k, level_factor(k), "X")
-        self._zero_velocity(k, t_ns, before, link)
+        aided = not self.gnss.is_outage(t_ns)
+        self._stationarity.update(self.chain, link, self.imu, self.wheels, before, aided)
         rolled_m = rolled.distance_m if rolled else None
         self._fresh = self._finish_keyframe(t_ns, gyro, rolled_m), dt, None if gap else rolled_m, gyro, accel
 
@@ -364,6 +366,12 @@ class Estimator:
     def _covariance(self) -> Array:
         """Marginal covariance (dim, dim) of the newest keyframe."""
         return self.chain.covariance()
+
+    @property
+    def _reported_covariance(self) -> Array:
+        """The same with what is not known of antenna and delay of the fixes."""
+        R = self.chain.state(self.chain.last).rotation
+        return self._place_doubt.widened(self._covariance, R, self.learned.place_moments())
 
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
@@ -417,27 +425,19 @@ class Estimator:
         self.wheels_rejected += not self._silent
         return wheels.doubted(variance, gate.doubt(nis))
 
-    def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
-        """Zero-velocity update where the robot has stood for a window."""
-        unknown = self.gnss.is_outage(t_ns)
-        sigma = np.inf if unknown else float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace()))
-        biases = before.bias.gyroscope(), before.bias.accelerometer()
-        if self._stationarity.is_stationary(
-            t_ns, self.imu, self.wheels, *biases, math.sqrt(before.velocity @ before.velocity), sigma
-        ):
-            add_zero_velocity(self.chain, k, link)
-
     def _emitted(self, t_ns: int, gyro: Array) -> State:
         key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
+        aided = not (self.gnss.local or self.gnss.is_outage(t_ns))
+        self._place_doubt.step(t_ns, key, float(key.rate(gyro)[2]), aided)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             terrain=self.weights.posterior(),
-            status="no_gnss" if self.gnss.local else ("outage" if self.gnss.is_outage(t_ns) else "running"),
+            status="running" if aided else ("no_gnss" if self.gnss.local else "outage"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
-            **state_fields(key, self._covariance, gyro, gyro_sigma),
+            **state_fields(key, self._reported_covariance, gyro, gyro_sigma),
         )
         self._state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
         if not self._silent:

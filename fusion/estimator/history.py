@@ -12,7 +12,9 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate, Innovation, State, WeightChange
 from terrafusion.fusion.estimator.key_states import key_state_of, smoothed
+from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.map_alignment import MapAlignment
+from terrafusion.fusion.estimator.place_doubt import widened_smoothed
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
@@ -47,21 +49,26 @@ class History:
         note += f"{np.degrees(alignment.yaw_rad):.0f} degrees"
         return (note if batch else f"{note}; live, all before was in a local frame: it is not scored",)
 
-    def smooth(self, archive: Chain, config: EstimatorConfig, aligned: bool) -> None:
+    def smooth(self, archive: Chain, config: EstimatorConfig, aligned: bool, learned: LearnedNumbers) -> None:
         """Replace the live states by the batch solution over the whole run, which starts from them.
 
-        Where fixes have `aligned` the path with the map, no state of it is local any more.
+        Where fixes have `aligned` the path with the map, no state of it is local any more. The covariances
+        hold what is not known of antenna and delay of the fixes at the end.
         """
         live = [key_state_of(state) for state in self.states]
         batch = BatchSmoother(archive, live)
         batch.optimise()
         keys, covariances = batch.states(), batch.covariances()
         offset = len(keys) - len(self.states)
-        imu, t_s = config.rig.sensors.imu, np.array([key.t_ns for key in self.states]) * 1e-9
+        times_ns = np.array([state.t_ns for state in self.states])
+        yaw_rates = [float(state.angular_velocity_radps[2]) for state in self.states]
+        moments = learned.past_place_moments(times_ns)
+        covariances = widened_smoothed(times_ns, keys[offset:], yaw_rates, covariances[offset:], moments)
+        imu, t_s = config.rig.sensors.imu, times_ns * 1e-9
         apart_s = np.diff(t_s, prepend=t_s[0] - config.keyframe_s)
         pairs = zip(self.noises, apart_s, strict=True)
         sigma_radps = np.array([gyro_sigma_radps(imu, dt_s, noise) for noise, dt_s in pairs])
-        self.states = smoothed(self.states, live, keys[offset:], covariances[offset:], sigma_radps)
+        self.states = smoothed(self.states, live, keys[offset:], covariances, sigma_radps)
         if aligned:
             self.states = [
                 dataclasses.replace(state, status="outage") if state.status == "no_gnss" else state

@@ -9,7 +9,7 @@ from collections import deque
 import gtsam
 import numpy as np
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.robot import SKIDDING, SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.numbers import (
@@ -20,13 +20,19 @@ from terrafusion.fusion.calibration.numbers import (
     GYRO_BIAS,
     NUMBERS,
     TURN_SCALE,
-    WHEEL_DELAY,
     WHEEL_SCALE,
     Knowledge,
     assumed,
     known_before,
 )
 from terrafusion.fusion.calibration.online import SelfCalibration
+from terrafusion.fusion.calibration.place_belief import (
+    PLACE,
+    REFUTED_SIGMA,
+    TIMELY_SIGMA_S,
+    PlaceBelief,
+    unrefuted,
+)
 from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.corrections import Corrections
@@ -57,8 +63,6 @@ TURN_TIME_S = 10.0
 
 CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 """Numbers that correct a sensor; the others only describe its noise or belong to another state."""
-CORRELATED = [*CORRECTED, WHEEL_DELAY, COURSE_LAG]
-"""Numbers whose errors are correlated: one can look like another."""
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 """Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
 rotation look alike (assumed)."""
@@ -70,12 +74,11 @@ LEAST_LATE_S, LEAST_LATE_TURNING_S, TURNING_RAD, MOST_MISFIT = 0.3, 0.15, 3.0, 1
 """Fixes later than the first (wheels that spin look less late), or than the second where the robot turned by
 so much, another antenna or another gyro can look like a skid; they explain it if the fixes then lie within
 about three of their sigma: a skid leaves a hundred and more (assumed)."""
-UNMODELLED_SIGMA = np.array([0.0, 0.03, 0.03, 0.03])
+UNMODELLED_SIGMA = np.array([0.0, 0.03, 0.03, TIMELY_SIGMA_S])
 """1 sigma of what slip adds to these numbers on any ground (turn share, m, m, s; assumed)."""
-CLEAR_SIGMA, STILL_CLEAR, REFUTED_SIGMA = np.array([5.0, 5.0, 5.0, 4.0]), 0.5, 4.0
+CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 4.0]), 0.5
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
-the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others.
-From `REFUTED_SIGMA` on a number is no longer taken to be as before while others are corrected."""
+the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +111,7 @@ class LearnedNumbers:
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known, self._skids = prior, config.rig.drive in SKIDDING
+        self._place: tuple[Knowledge, PlaceBelief] | None = None
         self._before_skid: Knowledge | None = None
         self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
@@ -200,6 +204,25 @@ class LearnedNumbers:
                 numbers.append(NumberAfterDrive(name, now.rad, now.sigma_rad, was.sigma_rad, corrects))
         return tuple(numbers)
 
+    def place_moments(self) -> Array:
+        """Second moments (3,) of the errors of antenna x, y and delay in use, m2 and s2."""
+        gnss = self._gnss
+        (x_m, y_m, _), late_s = (gnss.antenna_m - gnss.nominal_antenna_m).tolist(), gnss.delay_s
+        return self._moments_about(np.array([x_m, y_m, late_s]))
+
+    def past_place_moments(self, t_ns: TimesNs) -> Array:
+        """The same (N, 3) of those that were in use at the times (N,), by what is known now."""
+        lever_m, late_s = self._gnss.antenna_places.used(t_ns)
+        return self._moments_about(np.column_stack([(lever_m - self._gnss.nominal_antenna_m)[:, :2], late_s]))
+
+    def _moments_about(self, used: Array) -> Array:
+        if self.calibration is None:
+            return np.zeros_like(used)
+        if self._place is None or self._place[0] is not self._known:
+            corrected = self._clear[[CORRECTED.index(number) for number in PLACE]]
+            self._place = self._known, PlaceBelief.of(self._known, self._before, corrected)
+        return self._place[1].moments(used)
+
     def corrections(self) -> Corrections:
         """What the drive refuted of the robot's numbers."""
         numbers = frozenset(number.state for number in self.table() if number.corrects)
@@ -243,7 +266,7 @@ class LearnedNumbers:
     def _explained(self, learning: SelfCalibration) -> bool:
         """Whether other numbers of a robot with rolling wheels explain a drive that looks like a skid."""
         known = learning.known
-        if learning.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
+        if known.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
             return False
         least = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
         turning = learning.turned_rad > TURNING_RAD
@@ -296,10 +319,7 @@ class LearnedNumbers:
         rolling = known.slip_spread < MOST_SPREAD
         self._clear = clear = (size > limit) & (size > LEAST_CORRECTION) & rolling
         shown = [i for i, is_clear in zip(CORRECTED, clear.tolist(), strict=True) if is_clear]
-        kept = [i for i in CORRELATED if i not in shown and abs(off[i]) < REFUTED_SIGMA * sigma[i]]
-        covariance = known.covariance
-        gain = covariance[np.ix_(shown, kept)] @ np.linalg.pinv(covariance[np.ix_(kept, kept)])
-        corrected[clear] += off[shown] - gain @ off[kept]
+        corrected[clear], _ = known.given(shown, unrefuted(known, self._before, shown), self._before)
         return corrected
 
 

@@ -23,6 +23,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import no_motion_factor
+from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import GnssFix
 
@@ -121,6 +122,25 @@ class StationarityDetector:
         statistic = likelihood_ratio(gyro - gyro_bias_radps, accel - accel_bias_mps2, sigma_gyro, sigma_accel)
         return statistic < LIMIT
 
+    def update(
+        self,
+        chain: Chain,
+        link: gtsam.NonlinearFactorGraph,
+        imu: ImuStream,
+        wheels: WheelStream,
+        before: KeyState,
+        aided: bool,
+    ) -> None:
+        """Zero-velocity update of the newest keyframe where the robot has stood for a window.
+
+        `link` leads to it from the keyframe with the state `before`; `aided`: fixes hold the estimate.
+        """
+        sigma_mps = math.sqrt(chain.covariance()[VELOCITY, VELOCITY].trace()) if aided else math.inf
+        biases = before.bias.gyroscope(), before.bias.accelerometer()
+        speed_mps, t_ns = math.sqrt(before.velocity @ before.velocity), chain.nodes[-1].t_ns
+        if self.is_stationary(t_ns, imu, wheels, *biases, speed_mps, sigma_mps):
+            _add_zero_velocity(chain, link)
+
 
 def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
     """Drop samples and fixes that no start can use; True when some were dropped.
@@ -145,8 +165,9 @@ def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix])
     return True
 
 
-def add_zero_velocity(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) -> None:
-    """Zero velocity at keyframe k, and in its `link` no motion since the one before."""
+def _add_zero_velocity(chain: Chain, link: gtsam.NonlinearFactorGraph) -> None:
+    """Zero velocity at the newest keyframe, and in its `link` no motion since the one before."""
+    k = chain.last
     link.add(no_motion_factor(k))
     chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED), "V")
 

@@ -163,11 +163,10 @@ def test_numbers_known_before_the_drive_explain_no_slide(
 ) -> None:
     learned, mean = driving.learned, driving.learned._before.mean.copy()
     mean[ANTENNA_X] += 0.5
-    known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0)
+    known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0, misfit=2.0)
     assert learned.calibration is not None
     for holder, name in ((learned, "_before"), (learned.calibration, "known")):
         monkeypatch.setattr(holder, name, known)
-    monkeypatch.setattr(learned.calibration, "misfit", 2.0)
     assert not learned._explained(learned.calibration)
 
 
@@ -194,13 +193,13 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
     mean[number] += off
     learning = driving.learned.calibration
     assert learning is not None
-    was = learning.known, learning.misfit, learning.turned_rad
-    learning.known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0)
-    learning.misfit, learning.turned_rad = misfit, turned_rad
+    was = learning.known, learning.turned_rad
+    learning.known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0, misfit)
+    learning.turned_rad = turned_rad
     assert learned._explained(learning) is explained
     learning.known = dataclasses.replace(learning.known, slip_spread=0.2)
     assert not learned._explained(learning)
-    learning.known, learning.misfit, learning.turned_rad = was
+    learning.known, learning.turned_rad = was
 
 
 @pytest.mark.parametrize(("lag_s", "spread", "taken_s"), [(0.2, 0.03, 0.2), (0.2, 0.3, 0.0)])
