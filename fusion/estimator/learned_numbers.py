@@ -205,23 +205,29 @@ class LearnedNumbers:
         return tuple(numbers)
 
     def place_moments(self) -> Array:
-        """Second moments (3,) of the errors of antenna x, y and delay in use, m2 and s2."""
+        """Second moments (4,) of the errors of antenna x, y, delay and course lag in use, m2 and s2.
+
+        Of the lag, those on the grounds that were driven; its spread between grounds is in the graph.
+        """
         gnss = self._gnss
         (x_m, y_m, _), late_s = (gnss.antenna_m - gnss.nominal_antenna_m).tolist(), gnss.delay_s
         return self._moments_about(np.array([x_m, y_m, late_s]))
 
     def past_place_moments(self, t_ns: TimesNs) -> Array:
-        """The same (N, 3) of those that were in use at the times (N,), by what is known now."""
+        """The same (N, 4) of those that were in use at the times (N,), by what is known now."""
         lever_m, late_s = self._gnss.antenna_places.used(t_ns)
         return self._moments_about(np.column_stack([(lever_m - self._gnss.nominal_antenna_m)[:, :2], late_s]))
 
     def _moments_about(self, used: Array) -> Array:
+        """Moments (..., 4) about corrections (..., 3) of antenna and delay."""
         if self.calibration is None:
-            return np.zeros_like(used)
+            return np.zeros((*used.shape[:-1], 4))
         if self._place is None or self._place[0] is not self._known:
             corrected = self._clear[[CORRECTED.index(number) for number in PLACE]]
             self._place = self._known, PlaceBelief.of(self._known, self._before, corrected)
-        return self._place[1].moments(used)
+        lag_s, lag_sigma_s = self._known.mean[COURSE_LAG], self._known.sigma[COURSE_LAG]
+        lag_s2 = (lag_s - self.course_lag_s()[0]) ** 2 + lag_sigma_s**2
+        return np.concatenate([self._place[1].moments(used), np.full((*used.shape[:-1], 1), lag_s2)], axis=-1)
 
     def corrections(self) -> Corrections:
         """What the drive refuted of the robot's numbers."""

@@ -1,14 +1,13 @@
-"""What wrong antenna and delay of the fixes add to the reported covariance.
+"""What wrong antenna, delay of the fixes and course lag add to the reported covariance.
 
-Neither is a state of the graph. Fixes that come d later than taken for show where the robot was: they hold
-the place at -d v, and the heading at -d w where it turns at a mean rate w; an antenna farther by a holds the
-place at R a (sensitivities of a consider filter: Schmidt 1966, Adv. Control Systems 3). Without fixes the
-place moves on with the heading.
+None is a state of the graph. Fixes that come d later than taken for show where the robot was: they hold the
+place at -d v, and the heading at -d w where it turns at a mean rate w; an antenna farther by a holds the
+place at R a, and a course that lags by l more the heading at -l w (sensitivities of a consider filter:
+Schmidt 1966, Adv. Control Systems 3). Without fixes the place moves on with the heading.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,35 +15,37 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.fusion.graph.key_state import POSE, KeyState
 
-HEADING_TIME_S = 10.0
-"""Time over which fixes hold the heading (assumed)."""
+HEADING_TIME_S = 60.0
+"""Longest time over which fixes and gyro hold the heading together (assumed)."""
 
 
 class PlaceDoubt:
-    """Sensitivity of the estimate to antenna (x, y) and delay of the fixes, keyframe by keyframe.
+    """Sensitivity of the estimate to antenna (x, y), delay of the fixes and course lag, keyframe by keyframe.
 
     Attributes:
-        sensitivity: derivatives (3, 3) of east, north and yaw by antenna x, y (m) and delay (s).
+        sensitivity: derivatives (3, 4) of east, north and yaw by antenna x, y (m), delay and lag (s).
     """
 
     def __init__(self) -> None:
-        self.sensitivity = np.zeros((3, 3))
-        self._rate_radps, self._t_ns = 0.0, 0
+        self.sensitivity = np.zeros((3, 4))
+        self._rate_radps, self._began_ns, self._t_ns = 0.0, 0, 0
         self._place_m = np.zeros(2)
 
     def step(self, t_ns: int, key: KeyState, yaw_rate_radps: float, aided: bool) -> None:
         """To the next keyframe, at `t_ns`; `aided`: fixes hold it."""
         place_m = np.asarray(key.pose.translation())[:2]
-        dt_s, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
+        if not self._t_ns:
+            self._began_ns = self._t_ns = t_ns
+        held_s = min((t_ns - self._began_ns) * 1e-9, HEADING_TIME_S)
+        new = (t_ns - self._t_ns) * 1e-9 / held_s if held_s > 0.0 else 1.0
+        self._rate_radps += min(new, 1.0) * (yaw_rate_radps - self._rate_radps)
         east_m, north_m = (place_m - self._place_m).tolist()
-        self._place_m = place_m
-        new = -math.expm1(-dt_s / HEADING_TIME_S)
-        self._rate_radps += new * (yaw_rate_radps - self._rate_radps)
+        self._place_m, self._t_ns = place_m, t_ns
         if aided:
-            self.sensitivity = np.zeros((3, 3))
+            self.sensitivity = np.zeros((3, 4))
             self.sensitivity[:2, :2] = key.rotation[:2, :2]
             self.sensitivity[:2, 2] = -key.velocity[:2]
-            self.sensitivity[2, 2] = -self._rate_radps
+            self.sensitivity[2, 2:] = -self._rate_radps
         else:
             self.sensitivity[:2] += np.outer([-north_m, east_m], self.sensitivity[2])
 
@@ -53,7 +54,7 @@ class PlaceDoubt:
 
         Args:
             R: (3, 3) body to world.
-            moments: (3,) of the errors of antenna and delay, as of `PlaceBelief`.
+            moments: (4,) second moments of the errors of antenna, delay and lag, m2 and s2.
         """
         tangent = np.zeros((6, 3))
         tangent[3:, :2], tangent[:3, 2] = R[:2].T, R[2]
@@ -68,7 +69,7 @@ def widened_smoothed(
 ) -> Array:
     """Covariances P (N, dim, dim) of the keyframes of a batch, all of which fixes hold, with the doubt.
 
-    `moments` (N, 3) are those of the antenna and delay in use at the times (N,).
+    `moments` (N, 4) are those of the numbers in use at the times (N,).
     """
     doubt, out = PlaceDoubt(), []
     for at_ns, key, rate, covariance, moment in zip(

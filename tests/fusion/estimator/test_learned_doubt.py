@@ -14,6 +14,7 @@ from terrafusion.fusion.calibration.numbers import (
     GNSS_DELAY,
     IMITATED,
     NUMBERS,
+    SKIDDING_LAG_SIGMA_S,
     TURN_SCALE,
     WHEEL_SCALE,
     Knowledge,
@@ -223,3 +224,19 @@ def test_only_robots_that_skid_have_a_course_lag_that_changes_with_the_ground() 
     ):
         config = EstimatorConfig(dataclasses.replace(husky.rig(), drive=drive), husky.name)
         assert (Estimator(config).learned.course_lag_s()[1] > 0.0) is skids
+
+
+@pytest.mark.parametrize(("spread", "off_s"), [(0.03, 0.0), (0.3, 0.2)])
+def test_a_course_lag_is_doubted_by_its_sigma_and_by_what_is_not_corrected(
+    spread: float, off_s: float
+) -> None:
+    learned = Estimator.for_vehicle("husky").learned
+    mean, covariance = learned._before.mean.copy(), learned._before.covariance
+    mean[COURSE_LAG] = 0.2
+    learned._known = Knowledge(mean, covariance, spread, 300.0)
+    assert np.sqrt(learned.place_moments()[-1]) == pytest.approx(np.hypot(SKIDDING_LAG_SIGMA_S, off_s))
+
+
+def test_an_estimator_that_learns_nothing_of_its_sensors_takes_them_for_exact() -> None:
+    config = EstimatorConfig(load_vehicle("husky").rig(), "husky", self_calibrate=False)
+    assert not Estimator(config).learned.place_moments().any()

@@ -1,4 +1,4 @@
-"""What wrong antenna and delay of the fixes add to the reported covariance."""
+"""What wrong antenna, delay of the fixes and course lag add to the reported covariance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.simulate import simulate
 
 SPEED_MPS, DELAY_S, STEP_NS = 2.0, 0.1, 10**8
-MOMENTS = np.array([0.0, 0.0, DELAY_S**2])
+MOMENTS = np.array([0.0, 0.0, DELAY_S**2, 0.0])
 
 
 def key(east_m: float = 0.0, yaw_rad: float = 0.5 * np.pi) -> KeyState:
@@ -41,19 +41,29 @@ def test_with_fixes_a_delay_moves_the_place_along_its_velocity() -> None:
 def test_with_fixes_an_antenna_moves_the_place_in_body_axes() -> None:
     doubt = PlaceDoubt()
     doubt.step(STEP_NS, key(), 0.0, True)
-    assert np.diag(added(doubt, key(), np.array([0.04, 0.01, 0.0])))[3:5] == pytest.approx([0.04, 0.01])
+    assert np.diag(added(doubt, key(), np.array([0.04, 0.01, 0.0, 0.0])))[3:5] == pytest.approx([0.04, 0.01])
 
 
-def test_in_a_steady_turn_a_delay_turns_the_heading() -> None:
-    doubt, rate_radps = PlaceDoubt(), 0.5
-    for i in range(1, round(10.0 * HEADING_TIME_S * 1e9 / STEP_NS)):
+@pytest.mark.parametrize("number", [2, 3])
+def test_in_a_steady_turn_a_delay_or_a_course_lag_turns_the_heading(number: int) -> None:
+    doubt, rate_radps, moments = PlaceDoubt(), 0.5, np.zeros(4)
+    moments[number] = DELAY_S**2
+    for i in range(1, 20):
         doubt.step(i * STEP_NS, key(), rate_radps, True)
-    assert np.sqrt(added(doubt, key())[2, 2]) == pytest.approx(rate_radps * DELAY_S, rel=0.01)
+    assert np.sqrt(added(doubt, key(), moments)[2, 2]) == pytest.approx(rate_radps * DELAY_S, rel=0.01)
+
+
+def test_turns_to_both_sides_leave_the_heading() -> None:
+    doubt = PlaceDoubt()
+    for i in range(1, round(2.0 * HEADING_TIME_S * 1e9 / STEP_NS)):
+        doubt.step(i * STEP_NS, key(), 0.5 if i % 100 < 50 else -0.5, True)
+    assert np.sqrt(added(doubt, key())[2, 2]) < 0.1 * 0.5 * DELAY_S
 
 
 def test_without_fixes_the_place_keeps_its_shift_and_moves_on_with_the_heading() -> None:
     doubt = PlaceDoubt()
-    doubt.sensitivity = np.array([[0.0, 0.0, -SPEED_MPS], [0.0, 0.0, 0.0], [0.0, 0.0, -0.5]])
+    doubt.sensitivity = np.zeros((3, 4))
+    doubt.sensitivity[[0, 2], 2] = -SPEED_MPS, -0.5
     doubt.step(STEP_NS, key(10.0, 0.0), 0.0, False)
     sigma = np.sqrt(np.diag(added(doubt, key(10.0, 0.0))))
     assert sigma[3:5] == pytest.approx([SPEED_MPS * DELAY_S, 10.0 * 0.5 * DELAY_S])
