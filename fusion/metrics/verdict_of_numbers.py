@@ -19,6 +19,8 @@ LEARNED = {("imu-forward", "imu"): "imu_yaw_rad", ("clock-offset", "gnss"): "gns
 and channel."""
 DELAY_SIGMAS = 2.0
 """A delay of the fixes is likely from so many of its sigmas on (95 %)."""
+LEAST_STEP_M = 1e-4
+"""Shorter steps between keyframes show no direction."""
 
 
 def log_checks(run: Run) -> Iterator[Reason]:
@@ -35,7 +37,7 @@ def log_checks(run: Run) -> Iterator[Reason]:
 
 
 def delayed(run: Run) -> Iterator[Reason]:
-    """Late fixes that were not corrected, and which sigma does not cover."""
+    """Late fixes that were not corrected, by far more than sigma across the path, which holds no delay."""
     late, (speed_mps, variance_m2) = run.corrections.uncorrected_delay_s, _motion(run)
     if late is None or not len(speed_mps):
         return
@@ -46,8 +48,8 @@ def delayed(run: Run) -> Iterator[Reason]:
         yield (
             DOUBTFUL,
             f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
-            f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, which sigma does not "
-            "include; give the receiver's delay in the vehicle file, or drive longer",
+            f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, and are not corrected; "
+            "give the receiver's delay in the vehicle file, or drive longer",
         )
 
 
@@ -105,10 +107,17 @@ def unconfirmed_imu(run: Run) -> Iterator[Reason]:
 
 
 def _motion(run: Run) -> tuple[Array, Array]:
-    """Speeds (N - 1,) m/s between keyframes, and variances m2 of the next positions; empty if unknown."""
+    """Speeds (N - 1,) m/s between keyframes, and variances m2 of the next positions; empty if unknown.
+
+    The variances are those across the motion: along it they hold the doubt of the fixes' delay.
+    """
     path = run.estimate.trajectory
     if path.covariance is None or len(path) < 2:
         return np.zeros(0), np.zeros(0)
-    step_m = np.linalg.norm(np.diff(path.position_m[:, :2], axis=0), axis=1)
-    variance_m2 = path.covariance[1:, :2, :2].trace(axis1=1, axis2=2) / 2.0
+    east_m, north_m = np.diff(path.position_m[:, :2], axis=0).T
+    step_m, P = np.hypot(east_m, north_m), path.covariance[1:, :2, :2]
+    across = np.stack([-north_m, east_m], axis=1) / np.maximum(step_m, LEAST_STEP_M)[:, None]
+    variance_m2 = np.einsum("ni,nij,nj->n", across, P, across)
+    at_rest = step_m < LEAST_STEP_M
+    variance_m2[at_rest] = P[at_rest].trace(axis1=1, axis2=2) / 2.0
     return step_m / (np.diff(path.t_ns) * 1e-9), variance_m2
