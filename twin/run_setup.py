@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
-from terrafusion.twin.effects.catalogue import checked
+from terrafusion.twin.effects.catalogue import by_key, checked
 from terrafusion.twin.effects.steered import drive_terms
 from terrafusion.twin.model.motion import BodyMotion, motion_of, wheel_shares
 from terrafusion.twin.model.plant import Plant
@@ -96,7 +97,7 @@ def set_up(
     _check_stands(scenario, vehicle)
     slope, aspect = scenario.plane()
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)
-    known = checked({**vehicle.effects, **(effects or {})})
+    known = checked({**by_key(vehicle.effects), **by_key(effects or {})})
     plant = with_effects(Plant(parameters, route.table(seed)), known, drive_terms(vehicle.drive.type))
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
@@ -122,6 +123,8 @@ def _check_options(scenario: Scenario, vehicle: VehicleParams, seed: int) -> Non
             file=scenario.name,
             remedy=f"give single to {best.name.lower()}",
         )
+    if not isinstance(seed, Integral):
+        raise ConfigError(f"seed {seed!r} is no whole number", remedy="give one from 0")
     if seed < 0:
         raise ConfigError(f"seed {seed} is negative", remedy="give a whole number from 0")
 

@@ -13,6 +13,7 @@ import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,7 +102,7 @@ class Quantity(Parsed):
             RejectedError: otherwise.
         """
         items = list(raw) if self.size and isinstance(raw, (list, tuple)) else [raw]
-        numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in items)
+        numeric = all(isinstance(x, Real) and not isinstance(x, bool) for x in items)
         if not numeric or len(items) != (self.size or 1):
             raise RejectedError(f"'{{key}}' is '{shown(raw)}'", f"give {self.allowed()}")
         numbers = tuple(float(x) if abs(x) < 1e300 else math.inf for x in items)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import TypedDict
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.grounds.memory import GroundMemory
@@ -30,6 +31,18 @@ class EstimatorOptions(TypedDict, total=False):
     self_calibrate: bool
     declination_rad: float | None
     labels: GroundLabels | None
+
+
+_RANGES = {
+    "keyframe_s": Quantity("s", 0.01, 1.0),
+    "lag_s": Quantity("s", 0.0, 3600.0),
+    "wheel_wait_s": Quantity("s", 0.0, 3600.0),
+    "gnss_gate": Quantity("", 0.0, 1.0),
+    "wheel_gate_sigma": Quantity("", 0.0, 1e6),
+    "yaw_sigma_start_rad": Quantity("rad", 0.0, math.pi),
+    "start_without_gnss_s": Quantity("s", 0.0, 1e9),
+    "declination_rad": Quantity("rad", -math.pi, math.pi),
+}
 
 
 @dataclass(frozen=True)
@@ -99,9 +112,8 @@ class EstimatorConfig:
         ):
             if value not in known:
                 raise ConfigError(f"unknown {what} '{value}'", remedy=f"this version has {', '.join(known)}")
-        if not 0.01 <= self.keyframe_s <= 1.0:
-            raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
-        if self.declination_rad is not None and not abs(self.declination_rad) <= math.pi:
-            raise ConfigError(f"declination_rad is {self.declination_rad}", remedy="give -pi to pi rad")
+        for key, range_ in _RANGES.items():
+            if (value := getattr(self, key)) is not None:
+                checked_number(value, range_, file="the estimator", key=key)
         if self.lag_s < 5 * self.keyframe_s:
             raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

@@ -14,8 +14,10 @@
 Times in seconds count from the start of the recording.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,18 +132,32 @@ def parse_outage(text: str) -> Outage:
     Raises:
         ConfigError: not two finite numbers, a negative start, or no duration.
     """
-    start, colon, seconds = text.partition(":")
     try:
-        outage = Outage(float(start), float(seconds))
-    except ValueError:
-        outage = Outage(np.nan, np.nan)
-    sane = np.isfinite([outage.start_s, outage.seconds]).all()
-    if not (colon and sane and outage.start_s >= 0.0 and outage.seconds > 0.0):
+        return as_outage(text.split(":"))
+    except ConfigError:
         raise ConfigError(
             f"'{text}' is not an outage",
             remedy="write START:SECONDS with START >= 0 and SECONDS > 0, as in 120:60",
+        ) from None
+
+
+def as_outage(pair: Any) -> Outage:
+    """The outage of a pair (start, length) in seconds, or itself.
+
+    Raises:
+        ConfigError: not two finite numbers, a negative start, or no duration.
+    """
+    if isinstance(pair, Outage):
+        return pair
+    try:
+        start_s, seconds = map(float, pair)
+    except (TypeError, ValueError):
+        start_s = seconds = math.nan
+    if not (0.0 <= start_s < math.inf and 0.0 < seconds < math.inf):
+        raise ConfigError(
+            f"{pair!r} is not an outage", remedy="give pairs (start, length) in seconds, as in [(60, 30)]"
         )
-    return outage
+    return Outage(start_s, seconds)
 
 
 def score(

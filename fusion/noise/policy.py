@@ -144,7 +144,7 @@ def _shipped() -> Policy:
         return load_policy(path)
 
 
-def load_policy(path: Path | None = None) -> Policy:
+def load_policy(path: str | Path | None = None) -> Policy:
     """The policy file `path`, or the one shipped with the library.
 
     Raises:
@@ -152,6 +152,7 @@ def load_policy(path: Path | None = None) -> Policy:
     """
     if path is None:
         return _shipped()
+    path = Path(path)
     content = structure(PolicyFile, read_yaml(path), file=path)
     if "unknown" not in content.classes:
         raise ConfigError("'classes' has no 'unknown'", file=path, remedy="add the noise of unknown ground")

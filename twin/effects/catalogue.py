@@ -4,6 +4,7 @@ import difflib
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
@@ -101,18 +102,31 @@ def parameter_key(name: str) -> str:
     return name
 
 
+def by_key(values: Mapping[str, float]) -> dict[str, float]:
+    """The values by key; a bare effect means its first form.
+
+    Raises:
+        ConfigError: they are no mapping.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"effects are {values!r}", remedy='give {"slope": 0.05}, or several so')
+    return {parameter_key(name): value for name, value in values.items()}
+
+
 def checked(values: Mapping[str, float]) -> dict[str, float]:
     """The values as floats, sorted by key, those of zero left out; a bare effect means its first form.
 
     Raises:
         ConfigError: an unknown key, or a value that is no number or out of its range.
     """
-    out = {}
-    for key, value in sorted((parameter_key(name), value) for name, value in values.items()):
+    out: dict[str, float] = {}
+    for key, value in sorted(by_key(values).items()):
         _, parameter = lookup(key)
-        if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
+        if not (
+            isinstance(value, Real) and math.isfinite(value) and parameter.low <= value <= parameter.high
+        ):
             raise ConfigError(
-                f"effect '{key}' is {value:g}, out of range",
+                f"effect '{key}' is {value}, out of range",
                 remedy=f"give {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip(),
             )
         if value != 0.0:
