@@ -15,7 +15,7 @@ from terrafusion.datasets.core.channels import Channel, Imu, Terrain
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import Position, Sourced, Word, shown
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import DRIVES, axes_matrix
+from terrafusion.datasets.core.sensors import DRIVES, Rig, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
 Sign = Annotated[float, Sourced("", -1.0, 1.0)]
@@ -107,6 +107,23 @@ def _inertial(recording: Recording, c: Conventions) -> Recording:
         imu = dataclasses.replace(imu, gyro_radps=imu.gyro_radps * (1.0, 1.0, -1.0))
         recording = recording.with_notes("imu: yaw rate was positive to the right; its sign is changed")
     return dataclasses.replace(recording, imu=imu)
+
+
+def turned_as_mounted(recording: Recording, rig: Rig) -> Recording:
+    """Channels that are still in the axes of the IMU's frame, in body axes where `rig` has that frame."""
+    mounted = rig.sensors.imu
+    if not recording.unturned or mounted.frame_id.lstrip("/") != recording.imu_frame_id:
+        return recording
+    R, changed = mounted.base_from_sensor(), {}
+    for name in recording.unturned if mounted.axes != BODY_AXES else ():
+        channel = getattr(recording, name)
+        changed[name] = dataclasses.replace(
+            channel, **{key: permuted(R, value) for key, value in vars(channel).items() if key != "t_ns"}
+        )
+        recording = recording.with_notes(
+            f"{name}: rotated from {mounted.frame_id} to the body: axes {', '.join(mounted.axes)}"
+        )
+    return dataclasses.replace(recording, **changed, unturned=())
 
 
 def permuted(R: Array, values: Array) -> Array:

@@ -67,7 +67,8 @@ class Recording:
     it is known. `truth_channels` names what the truth really holds ("position",
     "yaw", "orientation", "velocity"; () for all of it): the rest of `truth` is removed.
     `truth_frame` is "base" or "antenna". `metadata` is what else the log says of itself.
-    `imu_frame_id` is the frame the log gives its IMU, where it gives one. `notes` records what a
+    `imu_frame_id` is the frame the log gives its IMU, where it gives one; `unturned` names the channels that
+    are still in its axes, as no vehicle was given to turn them into the body's. `notes` records what a
     reader assumed or left out, in sentences; `clock_jumps` what it repaired in the times.
     """
 
@@ -92,6 +93,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     clock_jumps: tuple[ClockJump, ...] = ()
     imu_frame_id: str = ""
+    unturned: tuple[str, ...] = ()
     barometer: Barometer | None = None
     magnetometer: Magnetometer | None = None
     steering: Steering | None = None

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ def open_recordings(
     path: Path | str,
     *,
     rig: Rig | None = None,
-    topics: dict[str, str] | None = None,
+    topics: Mapping[str, str] | None = None,
     stamps: str = "header",
     repair_clock: bool = False,
     columns: Path | str | None = None,
@@ -49,6 +50,8 @@ def open_recordings(
     """
     if stamps not in STAMPS:
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
+    if not (topics is None or isinstance(topics, Mapping)):
+        raise DataError(f"topics is {topics!r}", file=path, remedy="give {'imu': '/imu/data', ...}")
     place, number = find_log(path)
     form = format_of(place, mapped=columns is not None)
     entry, conventions, notes = _known(place, form)

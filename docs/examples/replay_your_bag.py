@@ -15,7 +15,7 @@ parser.add_argument("--vehicle", help="name or YAML file; by default what the lo
 parser.add_argument("--out", default="replay-out")
 arguments = parser.parse_args()
 
-log = tf.open(arguments.log) if arguments.log else tf.simulate("figure_eight", terrain="asphalt", seed=1)
+log = arguments.log or tf.simulate("figure_eight", terrain="asphalt", seed=1)
 result = tf.replay(log, vehicle=arguments.vehicle)
 print(result)  # scores against the truth of the log, or against fixes held out
 result.report(arguments.out)  # report.html, estimate.csv, metrics.json

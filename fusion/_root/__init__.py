@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.errors import DataError as DataError
     from terrafusion.datasets.core.errors import TerrafusionError as TerrafusionError
     from terrafusion.datasets.core.recording import Recording as Recording
-    from terrafusion.datasets.readers import open_recording as open
     from terrafusion.fusion.api.calibrations import calibrate_sensors as calibrate_sensors
     from terrafusion.fusion.api.diagnoses import Diagnosis as Diagnosis
     from terrafusion.fusion.api.diagnoses import diagnose as diagnose
+    from terrafusion.fusion.api.logs import open as open
     from terrafusion.fusion.api.replays import Replay as Replay
     from terrafusion.fusion.api.replays import replay as replay
     from terrafusion.fusion.api.studies import benchmark as benchmark
@@ -51,7 +51,7 @@ _HOMES = {
     "calibrate": "twin.calibrate.calibrate:calibrate",
     "calibrate_sensors": "fusion.api.calibrations:calibrate_sensors",
     "diagnose": "fusion.api.diagnoses:diagnose",
-    "open": "datasets.readers:open_recording",
+    "open": "fusion.api.logs:open",
     "policy": "policy:",
     "replay": "fusion.api.replays:replay",
     "simulate": "twin.simulate:simulate",

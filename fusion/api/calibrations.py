@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.outputs.robot_file import write_robot
 from terrafusion.fusion.sensor_calibration import SensorCalibration
 from terrafusion.fusion.sensor_calibration import calibrate_sensors as run

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from terrafusion.datasets.core.display import text_html
-from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.reports.gap import write_diagnosis
 from terrafusion.fusion.reports.gap_text import answer
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis

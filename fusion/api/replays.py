@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.display import text_html
-from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.grounds.file import read_grounds
 from terrafusion.fusion.grounds.memory import GroundMemory
-from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.metrics.scores import Outage, as_outage
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult
@@ -65,7 +65,7 @@ def replay(
     *,
     vehicle: str | Path | VehicleParams | None = None,
     mode: str = "adaptive",
-    policy: Path | Policy | None = None,
+    policy: str | Path | Policy | None = None,
     outages: Sequence[tuple[float, float] | Outage] = (),
     batch: bool = False,
     magnetometer: bool = False,
@@ -106,7 +106,7 @@ def replay(
         vehicle=vehicle,
         mode=mode,
         policy=policy,
-        outages=[o if isinstance(o, Outage) else Outage(*map(float, o)) for o in outages],
+        outages=[as_outage(pair) for pair in outages],
         batch=batch,
         progress=progress,
         magnetometer=magnetometer,

@@ -11,6 +11,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.twin.calibrate.answer import answer_of
 from terrafusion.twin.calibrate.coordinates import Prior
 from terrafusion.twin.calibrate.covariance import covariance_of
@@ -44,7 +45,7 @@ _GROUND = {
 
 
 def calibrate(
-    recordings: Recording | Sequence[Recording],
+    logs: Log | Sequence[Log],
     vehicle: str | Path | VehicleParams = "elevate",
     soils: Soils = None,
     parameters: Sequence[str] = PARAMETERS,
@@ -64,6 +65,7 @@ def calibrate(
     """Fit the named parameters to one or more logs of one vehicle.
 
     Args:
+        logs: recordings, or paths or catalogue names.
         vehicle: name, YAML file or `VehicleParams` to start from; the geometry that a log reports
             (`Recording.overrides`) replaces its own.
         soils: the ground of all logs (name, file or `SoilParams`); or grounds by the logs' labels; None:
@@ -86,28 +88,29 @@ def calibrate(
         TerrafusionError: the twin diverges at the start values.
     """
     # Inputs, checked.
-    logs_in = uniquely_named((recordings,) if isinstance(recordings, Recording) else tuple(recordings))
-    _check(logs_in, source, window_s)
+    known = as_vehicle(vehicle)
+    recordings = uniquely_named(tuple(opened(logs, known.rig())))
+    _check(recordings, source, window_s)
     for key, value in (("slope_deg", slope_deg), ("aspect_deg", aspect_deg), ("payload_kg", payload_kg)):
         checked_number(value, _GROUND[key], file="the calibration", key=key)
     # The model to start from, and its unknown parameters.
-    model, ground, notes = start_model(logs_in, as_vehicle(vehicle), soils, effects)
+    model, ground, notes = start_model(recordings, known, soils, effects)
     model = dataclasses.replace(
         model, slope_rad=math.radians(slope_deg), aspect_rad=math.radians(aspect_deg), payload_kg=payload_kg
     )
     coordinates = coordinates_of(parameters, model, priors or {})
     # The logs: input of the twin, windows, measurements averaged over intervals.
     wanted = None if channels is None else tuple(channels)
-    logs = [
+    prepared = [
         prepare(r, model, source=source, truth=truth, window_s=window_s, ground=ground, channels=wanted)
-        for r in logs_in
+        for r in recordings
     ]
-    refuse_bypassed(coordinates, logs)
+    refuse_bypassed(coordinates, prepared)
     # The search, with what the data identify.
-    problem = Problem(logs, model, coordinates, robust=robust)
+    problem = Problem(prepared, model, coordinates, robust=robust)
     solution, covariance, identified = _search(problem, progress)
     # The answer.
-    notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
+    notes += [f"{log.name}: {note}" for log in prepared for note in log.notes]
     return answer_of(problem, solution, covariance, identified, notes)
 
 

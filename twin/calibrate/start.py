@@ -11,6 +11,7 @@ from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.log import PreparedLog, grounds
 from terrafusion.twin.calibrate.model import Model, resolve
 from terrafusion.twin.calibrate.predict import FOLLOWING
+from terrafusion.twin.effects.catalogue import by_key
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, reported_geometry, with_overrides
 
@@ -46,7 +47,7 @@ def start_model(
     """
     geometry = reported_geometry(recordings)
     robot, notes = with_overrides(vehicle, geometry), list(geometry_notes(vehicle, geometry))
-    present = {**vehicle.effects, **(effects or {})}
+    present = {**by_key(vehicle.effects), **by_key(effects or {})}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
         return Model(robot, {soil.name: soil}, present), soil.name, notes

@@ -154,6 +154,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], timing.times["gnss_velocity"])
     others = {kind: built(kind) for kind in ("barometer", "magnetometer")}
     mounted = _mounted(builder, streams)
+    imu_frame = _usual_frame(streams["imu"]) if imu is not None else ""
     truth, frame = built("truth") or (None, "base")
     others |= {kind: built(kind) for kind in ("command", "terrain", "steering")}
     return Recording(
@@ -171,7 +172,8 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),
         notes=tuple(builder.notes),
         clock_jumps=timing.jumps,
-        imu_frame_id=_usual_frame(streams["imu"]) if imu is not None else "",
+        imu_frame_id=imu_frame,
+        unturned=tuple(name for name, frame in builder.unturned.items() if frame == imu_frame),
     )
 
 

@@ -67,6 +67,8 @@ class ChannelBuilder:
     notes: list[str] = field(default_factory=list)
     as_written: bool = False
     frames: StaticFrames = field(default_factory=StaticFrames)
+    unturned: dict[str, str] = field(default_factory=dict)
+    """Frames of the channels that are left in the axes of their sensor, as no vehicle is given."""
 
     def command(self, stream: Stream, t_ns: TimesNs) -> Command:
         """Commanded twists."""
@@ -117,12 +119,16 @@ class ChannelBuilder:
         if mounting is not None and tells_turn(mounting, frames[0], self.rig):
             self.notes.append(mounting_note(name, frames[0], mounting))
             R = mounting[1]
+            if self.rig is None and np.array_equal(R, np.eye(3)):
+                self.unturned[name] = frames[0]
             return vectors if np.array_equal(R, np.eye(3)) else tuple(turned_by(R, v) for v in vectors)
         if self.rig is None:
             if self.known.imu_axes == BODY_AXES:
+                if len(frames) == 1:
+                    self.unturned[name] = frames[0]
                 self.notes.append(
-                    f"{name}: no vehicle given: {stream.topic} (frame {names}) taken as x forward, y left, "
-                    "z up"
+                    f"{name}: no vehicle given: {stream.topic} (frame {names}) taken as x forward, "
+                    "y left, z up"
                 )
             return vectors
         spec = self.rig.sensors.imu

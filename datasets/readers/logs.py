@@ -1,0 +1,35 @@
+"""Logs as the functions of the library take them: opened, or a path to open."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from terrafusion.datasets.core.conventions import turned_as_mounted
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.readers.open import open_recording
+
+Log = Recording | str | Path
+
+
+def opened(logs: Log | Sequence[Log], rig: Rig | None = None) -> list[Recording]:
+    """Recordings of one log or several, with the sensors turned as the vehicle has them mounted.
+
+    Args:
+        logs: recordings, or paths or catalogue names of logs that hold one.
+        rig: the vehicle's; None: as each log says.
+
+    Raises:
+        DataError: what is given is no log, or a log cannot be read.
+    """
+    several = logs if isinstance(logs, Iterable) and not isinstance(logs, str) else [logs]
+    return [_opened(log, rig) for log in several]
+
+
+def _opened(log: Log, rig: Rig | None) -> Recording:
+    if not isinstance(log, (Recording, str, Path)):
+        raise DataError(
+            f"a {type(log).__name__} is no log", remedy="give a Recording, or the path or name of a log"
+        )
+    recording = log if isinstance(log, Recording) else open_recording(log, rig=rig)
+    return recording if rig is None else turned_as_mounted(recording, rig)

@@ -1,0 +1,104 @@
+"""Arguments of the public functions: logs as recordings or paths, and one clear line for wrong ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import terrafusion as tf
+from terrafusion.datasets.readers.logs import opened
+from terrafusion.datasets.writers.log_folder import write_log_folder
+from tests.datasets.ros_bags import MAKE1, imu_messages, write_ros1
+
+MOUNTED = 'robot: {extends: elevate, imu_axes: ["-z", "-x", "+y"], imu_frame: front_imu}\n'
+
+
+@pytest.fixture(scope="module")
+def log() -> tf.Recording:
+    return tf.simulate("straight", terrain="grass", seed=1)
+
+
+@pytest.mark.parametrize("frame", ["front_imu", "/front_imu", "rear_imu"])
+def test_a_vehicle_turns_the_imu_of_a_bag_that_was_opened_without_it(tmp_path: Path, frame: str) -> None:
+    (tmp_path / "robot.yaml").write_text(MOUNTED)
+    vehicle = tf.Vehicle.load(tmp_path / "robot.yaml")
+    bag = write_ros1(tmp_path / "a.bag", imu_messages(MAKE1, gyro=(1.0, 2.0, 3.0), frame=frame))
+    with_vehicle = tf.open(bag, vehicle=vehicle)
+    (later,) = opened(tf.open(bag), vehicle.rig())
+    assert with_vehicle.imu is not None
+    assert later.imu is not None
+    assert later.imu.gyro_radps[0].tolist() == ([1.0, 2.0, 3.0] if "rear" in frame else [-3.0, -1.0, 2.0])
+    assert np.array_equal(later.imu.accel_mps2, with_vehicle.imu.accel_mps2)
+    assert any("rotated from front_imu to the body" in note for note in later.notes) is ("rear" not in frame)
+    assert opened(later, vehicle.rig()) == [later]  # once only
+
+
+def test_calibrate_takes_paths(log: tf.Recording, tmp_path: Path) -> None:
+    folder = write_log_folder(log, tmp_path / "log")
+    name = "vehicle.wheel.radius_m"
+    by_path = tf.calibrate(str(folder), vehicle="elevate", soils="grass", parameters=[name])
+    assert by_path[name].value == tf.calibrate(log, "elevate", "grass", [name])[name].value
+
+
+def test_a_policy_may_be_a_path_as_text(log: tf.Recording, tmp_path: Path) -> None:
+    with pytest.raises(tf.ConfigError, match=r"mine\.yaml: no such file"):
+        tf.replay(log, policy=str(tmp_path / "mine.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"outages": (60, 30)}, r"60 is not an outage; give pairs \(start, length\)"),
+        ({"outages": [(20, -10)]}, r"\(20, -10\) is not an outage"),
+        ({"outages": [(20, float("nan"))]}, "is not an outage"),
+        ({"outages": ["20:10"]}, "'20:10' is not an outage"),
+        ({"outages": [(20, 10, 5)]}, "is not an outage"),
+        ({"lag_s": float("nan")}, "'lag_s' is nan, out of range"),
+        ({"lag_s": float("inf")}, "'lag_s' is inf, out of range"),
+        ({"lag_s": "5"}, "'lag_s' is '5'; give"),
+        ({"lag_s": 0.2}, "at least five keyframes"),
+    ],
+)
+def test_a_replay_refuses_wrong_arguments(log: tf.Recording, wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(tf.ConfigError, match=message):
+        tf.replay(log, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"effects": ["slope"]}, r"effects are \['slope'\]; give"),
+        ({"effects": {"slope": None}}, "effect 'slope/uniform' is None, out of range"),
+        ({"effects": {"slope": "0.1"}}, "effect 'slope/uniform' is 0.1, out of range"),
+        ({"seed": 1.5}, r"seed 1\.5 is no whole number"),
+        ({"seed": "1"}, "seed '1' is no whole number"),
+    ],
+)
+def test_a_simulation_refuses_wrong_arguments(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(tf.ConfigError, match=message):
+        tf.simulate("straight", **wrong)
+
+
+@pytest.mark.parametrize("wrong", [None, 5, [None]])
+def test_what_is_no_log_is_refused(wrong: Any) -> None:
+    with pytest.raises(tf.DataError, match="is no log; give a Recording, or the path"):
+        tf.replay(wrong)
+
+
+def test_topics_are_a_mapping(tmp_path: Path) -> None:
+    bag = write_ros1(tmp_path / "a.bag", imu_messages(MAKE1))
+    with pytest.raises(tf.DataError, match=r"topics is 'imu=/imu/data'; give \{'imu'"):
+        tf.open(bag, topics="imu=/imu/data")  # type: ignore[arg-type]
+
+
+def test_an_effect_by_its_short_name_replaces_that_of_the_vehicle() -> None:
+    sloping = dataclasses.replace(tf.Vehicle.load("elevate"), effects={"slope/uniform": 0.1})
+    short = tf.simulate("straight", vehicle=sloping, effects={"slope": 0.05}).wheels
+    full = tf.simulate("straight", effects={"slope/uniform": 0.05}).wheels
+    assert short is not None
+    assert full is not None
+    assert np.array_equal(short.speed, full.speed)
