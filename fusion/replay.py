@@ -256,5 +256,5 @@ def _run_estimator(
         history.smooth(archive, estimator.config, estimator.gnss.alignment is not None, estimator.learned)
     seconds = time.perf_counter() - started
     if not history.states:
-        raise never_started(drive.used)
+        raise never_started(drive.given, drive.config.rig.wheel_radius_m)
     return _FinishedRun(estimator, history, alignment_notes, seconds, latencies_ms)

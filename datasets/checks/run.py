@@ -64,6 +64,7 @@ CHECKS: tuple[Check, ...] = (
     gnss_frame.check_velocity,
     truth.check_unit,
     truth.check_yaw,
+    truth.check_frame,
     scale.check_speed_scale,
     environment.check_pressure,
     environment.check_field,

@@ -1,14 +1,16 @@
-"""The truth: its yaw against its own course, its unit against the wheels."""
+"""The truth: its yaw against its own course, its unit against the wheels, its frame against the fixes."""
 
 import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, with_fields
-from terrafusion.datasets.checks.motion import on_plane, seconds, wheel_speed
+from terrafusion.datasets.checks.motion import on_plane, seconds, typical_sigma, wheel_speed
 from terrafusion.datasets.checks.path import fit_windows, path_by
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -20,6 +22,7 @@ LARGE_OFFSET = np.radians(30.0)
 """Robots that side-slip across a slope crab by less."""
 UNITS = {"mm": 1000.0, "cm": 100.0, "feet": 1.0 / 0.3048}
 UNIT_ERROR = 0.1
+LEAST_FIXES, LEAST_APART_M = 20, 1.0
 
 
 def check_yaw(context: CheckContext) -> Iterator[Finding]:
@@ -98,6 +101,62 @@ def check_unit(context: CheckContext) -> Iterator[Finding]:
                 partial(_scaled, factor=1.0 / factor),
             )  # fmt: skip
             return
+
+
+def check_frame(context: CheckContext) -> Iterator[Finding]:
+    """Truth and fixes must have one frame: scores compare the two as they are."""
+    gnss, truth = context.recording.gnss, context.recording.truth
+    if gnss is None or truth is None:
+        return
+    known = np.isfinite(truth.position_m[:, :2]).all(axis=1)
+    t_ns, place = truth.t_ns[known], on_plane(truth.position_m[known])
+    first, last = (int(t_ns[0]), int(t_ns[-1])) if len(t_ns) else (0, -1)
+    fixes = gnss.select((gnss.t_ns >= first) & (gnss.t_ns <= last) & (gnss.fix != Fix.NONE))
+    if len(fixes) < LEAST_FIXES:
+        return
+    there = np.interp((fixes.t_ns - first).astype(float), (t_ns - first).astype(float), place)
+    seen, sigma_m = on_plane(fixes.enu_m), typical_sigma(fixes)
+    turn, shift = _moved_onto(there, seen)
+    apart_m, left_m = (float(np.median(np.abs(seen - at))) for at in (there, turn * there + shift))
+    if not apart_m > max(LEAST_APART_M, 5.0 * left_m, 5.0 * sigma_m):
+        return
+    degrees, middle = float(np.degrees(np.angle(turn))), complex(there.mean())
+    away = turn * middle + shift - middle
+    yield Finding(
+        "truth-frame", "warning", "truth",
+        f"the truth is not in the frame of the fixes: turned by {-degrees:.1f} deg, its middle "
+        f"{-away.real:.3g} m east and {-away.imag:.3g} m north of theirs",
+        f"median distance from {len(fixes)} fixes {apart_m:.3g} m, {left_m:.2g} m once that is removed",
+        "turn and move it onto the fixes, and leave its covariance out",
+        changed("truth", _placed, turn=turn, shift=shift),
+    )  # fmt: skip
+
+
+def _moved_onto(points: NDArray[np.complex128], others: NDArray[np.complex128]) -> tuple[complex, complex]:
+    """Turn (of length 1) and shift that bring points (n,) closest to others (n,), by the nearer half."""
+    use, turn = np.ones(len(points), dtype=bool), 1.0 + 0.0j
+    for _ in range(3):
+        a, b = points[use] - points[use].mean(), others[use] - others[use].mean()
+        product = complex(np.vdot(a, b))
+        turn = product / abs(product) if product else turn
+        shift = complex(others[use].mean() - turn * points[use].mean())
+        left = np.abs(turn * points + shift - others)
+        use = left <= np.median(left)
+    return turn, shift
+
+
+def _placed(truth: Trajectory, turn: complex, shift: complex) -> Trajectory:
+    """The truth in another frame of the world: turned about z, then moved."""
+    from scipy.spatial.transform import Rotation
+
+    place, position = turn * on_plane(truth.position_m) + shift, truth.position_m.copy()
+    position[:, 0], position[:, 1] = place.real, place.imag
+    quaternion = truth.quaternion
+    if quaternion is not None:
+        known = np.isfinite(quaternion).all(axis=1)
+        quaternion, about_z = quaternion.copy(), Rotation.from_euler("z", np.angle(turn))
+        quaternion[known] = (about_z * Rotation.from_quat(quaternion[known])).as_quat()
+    return dataclasses.replace(truth, position_m=position, quaternion=quaternion, covariance=None)
 
 
 def _scaled(recording: Recording, factor: float) -> Recording:

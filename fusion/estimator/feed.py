@@ -42,7 +42,8 @@ def split_fixes(recording: Recording, outages: Sequence[Outage]) -> tuple[Gnss |
         return None, None
     held = np.zeros(len(gnss), dtype=bool)
     if recording.truth is None or not len(recording.truth):
-        held[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] = True
+        times = np.unique(gnss.t_ns, return_inverse=True)[1]  # a fix that is there twice is held out twice
+        held = times % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
     for outage in outages:
         held |= outage.covers(gnss.t_ns, recording.start_ns)
     return gnss.select(~held), (gnss.select(held) if held.any() else None)
@@ -153,12 +154,18 @@ def too_short() -> DataError:
     return DataError("the log is too short to start from", remedy="give at least two seconds")
 
 
-def never_started(gnss: Gnss | None) -> DataError:
-    """The error of a log from which the estimator, given the fixes `gnss`, did not start."""
-    if gnss is not None and len(gnss):
-        return DataError(
-            "the robot never moved far enough for GNSS to show its heading",
-            channel="gnss",
-            remedy="replay a longer drive, or leave the GNSS channel out for a local path",
-        )
-    return too_short()
+def never_started(given: Recording, wheel_radius_m: float) -> DataError:
+    """The error of a log, as the estimator got it, from which it did not start."""
+    gnss, wheels = given.gnss, given.wheels
+    if gnss is None or wheels is None or not len(gnss):
+        return too_short()
+    span_m = float(np.hypot(*np.ptp(gnss.enu_m[:, :2], axis=0)))
+    speed_mps = wheels.side_speeds_mps(wheel_radius_m).mean(axis=1)
+    path_m = float(np.abs(speed_mps[1:]) @ np.diff(wheels.t_ns)) * 1e-9
+    return DataError(
+        "the robot never moved far enough for GNSS to show its heading: "
+        f"the fixes lie within {span_m:.3g} m, the wheels ran {path_m:.3g} m",
+        channel="gnss",
+        remedy="where these differ, check units and times of both; else replay a longer drive, or leave the "
+        "GNSS channel out for a local path",
+    )

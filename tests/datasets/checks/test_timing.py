@@ -375,6 +375,14 @@ def test_short_logs_have_no_finding(drive: Recording) -> None:
         assert found_in(dataclasses.replace(drive, truth=drive.truth.select(slice(0, n)))) == []
 
 
+def test_a_single_fix_does_not_make_other_clocks_wrong(drive: Recording) -> None:
+    assert drive.gnss is not None
+    first = drive.gnss.select(slice(0, 1))
+    early = dataclasses.replace(first, t_ns=first.t_ns - 10_000_000)  # before the first sample of the IMU
+    start_ns = min(drive.start_ns, int(early.t_ns[0]))
+    assert found_in(dataclasses.replace(drive, gnss=early, start_ns=start_ns)) == []
+
+
 def test_the_husky_bag_has_no_finding(field_logs: Path, husky_rig: Rig) -> None:
     assert found_in(open_recording(field_logs / "test1.bag", rig=husky_rig), husky_rig) == []
 

@@ -294,6 +294,16 @@ def test_every_fifth_fix_is_kept_back_without_truth(mixed: Recording) -> None:
     assert held is None
 
 
+def test_a_repeated_fix_is_kept_back_with_its_repetition(mixed: Recording) -> None:
+    assert mixed.gnss is not None
+    twice = mixed.gnss.select(np.repeat(np.arange(len(mixed.gnss)), 2))
+    used, held = split_fixes(dataclasses.replace(mixed, truth=None, gnss=twice), [])
+    assert used is not None
+    assert held is not None
+    assert len(held) == 2 * len(np.unique(held.t_ns))
+    assert np.isin(held.t_ns, used.t_ns).sum() == 0
+
+
 def test_rtk_fixes_are_believed_on_a_robot_whose_sheet_says_metres() -> None:
     """The vehicle's receiver drifts by metres, but what the log holds are fixes of 1 cm: another receiver."""
     drive = simulate("figure_eight", vehicle="pathfinder", terrain="asphalt", seed=3)
