@@ -29,7 +29,13 @@ from terrafusion.fusion.metrics.judged_run import (
     gnss_innovations,
     since_s,
 )
-from terrafusion.fusion.metrics.verdict_of_numbers import delayed, log_checks, refuted, unconfirmed_imu
+from terrafusion.fusion.metrics.verdict_of_numbers import (
+    delayed,
+    log_checks,
+    misplaced_truth,
+    refuted,
+    unconfirmed_imu,
+)
 
 WORDS = {GOOD: "good", DOUBTFUL: "doubtful", UNUSABLE: "not to be used"}
 
@@ -80,7 +86,7 @@ class Verdict:
 
 def judge(run: Run) -> Verdict:
     """The verdict on a run: the gravest of its reasons; if there are none, on what `good` rests."""
-    reasons = [reason for test in TESTS for reason in test(run)]
+    reasons = list(misplaced_truth(run)) or [reason for test in TESTS for reason in test(run)]
     for value in (UNUSABLE, DOUBTFUL):
         if any(reason[0] == value for reason in reasons):
             ordered = sorted(reasons, key=lambda reason: reason[0] != UNUSABLE)

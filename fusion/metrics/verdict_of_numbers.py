@@ -23,6 +23,13 @@ LEAST_STEP_M = 1e-4
 """Shorter steps between keyframes show no direction."""
 
 
+def misplaced_truth(run: Run) -> Iterator[Reason]:
+    """A truth in another frame than the fixes: no error against it says anything of the estimate."""
+    for finding in run.findings if run.scores.against == "truth" else ():
+        if finding.code == "truth-frame":
+            yield DOUBTFUL, f"errors are not judged: {finding.what} ({finding.evidence}); {finding.fix}"
+
+
 def log_checks(run: Run) -> Iterator[Reason]:
     """Findings of the log checks that the estimator did not settle itself."""
     for finding in run.findings:

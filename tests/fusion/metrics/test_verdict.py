@@ -68,6 +68,13 @@ def test_far_from_the_truth_is_not_to_be_used(drive):
     assert "15.8 m RMS against the ground truth" in found.reasons[0]
 
 
+def test_errors_against_a_truth_in_another_frame_are_not_judged(drive):
+    finding = Finding("truth-frame", "warning", "truth", "the truth is turned", "by 70 deg", "turn it")
+    found = verdict(drive(offset_m=(15.0, 5.0)), findings=[finding])
+    assert found.value == "doubtful"
+    assert found.reasons == ("Errors are not judged: the truth is turned (by 70 deg); turn it.",)
+
+
 def test_far_on_a_long_way_is_doubtful(drive):
     d = drive(seconds=300.0, offset_m=(11.0, 0.0), sigma_m=9.0)
     assert verdict(d, estimate=consistent(d)).value == "doubtful"
