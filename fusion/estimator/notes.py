@@ -20,7 +20,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             "the path is local, its start and heading are arbitrary"
         )
     if gnss.too_late:
-        notes.append(f"{gnss.too_late} GNSS fixes came before the start or too late for the lag")
+        fixes = "fix" if gnss.too_late == 1 else "fixes"
+        notes.append(f"{gnss.too_late} GNSS {fixes} came before the start or too late for the lag")
     if gnss.turned:
         notes.append(f"the heading was wrong and was set right from the motion {times(gnss.turned)}")
     notes += gnss.plausible.notes()

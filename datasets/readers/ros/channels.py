@@ -214,6 +214,11 @@ class ChannelBuilder:
         stream, t_ns = stream.select(held), t_ns[held]
         speed = joint_values(stream, [*joints.values()], "velocity")
         angle = joint_values(stream, [*joints.values()], "position")
+        begin = _first_known(angle if speed is None else speed)
+        if begin:
+            self.notes.append(f"wheels: {stream.topic}: the first {begin} messages hold no number; left out")
+            speed, angle = (None if v is None else v[begin:] for v in (speed, angle))
+            t_ns = t_ns[begin:]
         chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
         self.notes.append(f"wheels: joints of {stream.topic}: {chosen}")
         if angle is not None and not self.as_written:
@@ -354,13 +359,18 @@ class ChannelBuilder:
         twist[variance >= UNKNOWN_VARIANCE] = np.nan
         return twist if np.nan_to_num(twist).any() else None
 
-    def _refuse_nan(self, values: Array, t_ns: TimesNs, topic: str, what: str = "value") -> None:
+    def _refuse_nan(self, values: Array, t_ns: TimesNs, topic: str, what: str = "number") -> None:
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             raise DataError(
-                f"{int(bad.sum())} of {len(values)} messages have a {what} that is not a finite number",
+                f"{int(bad.sum())} of {len(values)} messages have no finite {what}",
                 channel=topic,
                 time_s=float(t_ns[i] - self.start_ns) * 1e-9,
                 remedy="correct the driver, or filter these messages out of the bag",
             )
+
+
+def _first_known(values: Array | None) -> int:
+    """The first row of values (N, k) with a number: drivers publish NaN until the hardware answers."""
+    return 0 if values is None else int(np.argmax(np.isfinite(values).any(axis=1)))

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 EXACT_IN_FLOAT32 = 2.0e4
 """Numbers up to this size are sent in single precision: their steps are below 2 mm there."""
+TIME_LABEL_PX = 16
+"""Of the label below a figure over time."""
 NO_VALUE = "#80808040"
 _OWN_ID = re.compile(r'"id": "(p\d+)"')
 _ID = re.compile(r'"(p\d+)"')
@@ -91,7 +93,7 @@ class Sheet:
         """
         shown = {} if limits is None else {"y_range": tuple(map(float, limits))}
         plot = self.add(
-            f"over time {key}", None, label, height, "xbox_zoom,xpan,xwheel_zoom,reset",
+            f"over time {key}", "time, s", label, height + TIME_LABEL_PX, "xbox_zoom,xpan,xwheel_zoom,reset",
             x_range=self.time, y_axis_type="log" if log else "linear", active_drag="xbox_zoom", **shown,
         )  # fmt: skip
         plot.panel.figure.add_layout(self.cursor)

@@ -52,6 +52,19 @@ def test_angles_that_do_not_tell_give_way_to_speeds(tmp_path: Path) -> None:
         open_recording(joint_bag(tmp_path / "alone", true % TURN))
 
 
+def test_joints_without_numbers_until_the_hardware_answers_are_left_out(tmp_path: Path) -> None:
+    speed = np.full((20, 2), 2.0)
+    speed[:3] = np.nan
+    recording = open_recording(joint_bag(tmp_path / "bag", np.cumsum(np.full((20, 2), 0.2), axis=0), speed))
+    assert recording.wheels is not None
+    assert recording.wheels.speed.tolist() == [[2.0, 2.0]] * 17
+    assert recording.wheels.t_ns[0] == T0 + 3 * 10**8
+    assert any("/base/joints: the first 3 messages hold no number" in note for note in recording.notes)
+    speed[10] = np.nan
+    with pytest.raises(DataError, match=r"/base/joints, t = 1\.000 s: 1 of 17 messages have no finite wheel"):
+        open_recording(joint_bag(tmp_path / "later", np.zeros((20, 2)), speed))
+
+
 def bag_beside_imu(path: Path, topic: str, msgtype: str, *messages: Any) -> Path:
     """An IMU and another topic, at 20 Hz."""
     found = [(topic, msgtype, T0 + k * 50_000_000, message) for k, message in enumerate(messages)]
