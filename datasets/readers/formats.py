@@ -130,6 +130,8 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         found = table or next((form for form in FORMATS if form.claims(path, head)), None)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
+    if found is None and head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise DataError("is text in UTF-16", file=path, remedy="save it as UTF-8")
     if found is None:
         kinds = ", ".join(form.description for form in FORMATS)
         raise DataError(

@@ -7,6 +7,7 @@ policy = terrafusion.policy.fit("policy.yaml", seeds=3)  # from drives of the tw
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 from terrafusion.fusion.noise.policy import load_policy as load
 
@@ -27,7 +28,7 @@ def fit(
 
     Args:
         out: the YAML file.
-        seeds: drives of each condition.
+        seeds: drives of each condition, at least one.
         vehicle: name of a vehicle of the library, which the drives are made with.
         logs: labelled logs of that vehicle.
         progress: called after each drive.
@@ -40,6 +41,8 @@ def fit(
     from terrafusion.fusion.training.policy_logs import read_logs
     from terrafusion.fusion.training.simulated_runs import GROUNDS
 
+    if seeds < 1:
+        raise ConfigError(f"{seeds} seeds", remedy="give a whole number from 1")
     logged = read_logs([str(log) for log in logs], vehicle) if logs else LoggedSamples()
     fitted = fit_policy(default_grid(seeds, tuple(GROUNDS), vehicle), progress or (lambda: None), logged)
     write_policy(fitted, Path(out), made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")

@@ -46,7 +46,7 @@ def diagnose(
     references: Log | Sequence[Log] = (),
     vehicle: str | Path | VehicleParams = "elevate",
     terrain: Soils = None,
-    effects: Sequence[str] | None = None,
+    effects: str | Sequence[str] | None = None,
     significance: float = 0.05,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
@@ -58,7 +58,7 @@ def diagnose(
         references: logs that count as normal; none: replicates of the twin stand in for them.
         vehicle: the twin's vehicle: name, YAML file or `Vehicle`.
         terrain: ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
-        effects: candidates by name; None: the whole catalogue.
+        effects: candidate or candidates by name; None: the whole catalogue.
         significance: threshold of the test for a gap.
         seed: of the replicates.
         progress: called with the share done, 0 to 1.
@@ -70,7 +70,8 @@ def diagnose(
     params = as_vehicle(vehicle)
     judged, normal = opened(runs, params.rig()), opened(references, params.rig())
     result = run(
-        judged, normal, params, terrain, effects=effects, significance=significance, seed=seed,
+        judged, normal, params, terrain, effects=[effects] if isinstance(effects, str) else effects,
+        significance=significance, seed=seed,
         progress=progress,
     )  # fmt: skip
     return Diagnosis(**vars(result))

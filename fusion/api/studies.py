@@ -49,7 +49,7 @@ def benchmark(
     *,
     quick: bool = False,
     seeds: int | None = None,
-    only: Sequence[str] = (),
+    only: str | Sequence[str] = (),
     jobs: int = 1,
     backend: str = "loky",
     address: str | None = None,
@@ -79,7 +79,7 @@ def benchmark(
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import at_the_end, origin_of, write_benchmark
 
-    plan = BenchmarkPlan(families_of(list(only)), seeds, quick)
+    plan = BenchmarkPlan(families_of([only] if isinstance(only, str) else list(only)), seeds, quick)
     origin = origin_of(plan, "terrafusion.benchmark")
     result = run_benchmark(plan, Path(out), jobs=jobs, backend=backend, address=address, progress=progress)
     write_benchmark(Path(out), result, at_the_end(origin))

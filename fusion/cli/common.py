@@ -43,7 +43,8 @@ TopicOption = Annotated[
     typer.Option(
         "--topic",
         metavar="CHANNEL=/NAME",
-        help="Topic of a channel (imu, wheels, gnss, command, truth, terrain); repeat for more.",
+        help="Topic of a channel (imu, wheels, gnss, gnss_velocity, steering, barometer, magnetometer, "
+        "command, truth, terrain); repeat for more.",
     ),
 ]
 StampsOption = Annotated[

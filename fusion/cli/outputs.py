@@ -12,6 +12,7 @@ from terrafusion.datasets.core.scratch import UNFINISHED, is_part
 
 ROOT = Path("terrafusion-out")
 LOG_FILES = ("meta.yaml", "*.csv", "*.csv.gz")
+FILE_ENDINGS = (".bag", ".db3", ".csv", ".gz", ".zip", ".json", ".yaml", ".yml", ".html")
 FORCED = "give another name, or --force to replace it"
 
 
@@ -52,6 +53,13 @@ class Output:
         return out
 
     def _check_folder(self, out: Path, force: bool) -> None:
+        if out.suffix in FILE_ENDINGS and not out.is_dir():
+            bag = ", or of a file ending in .mcap" if set(LOG_FILES) <= {*self.names} else ""
+            raise TerrafusionError(
+                f"a folder is written, no {out.suffix} file",
+                file=out,
+                remedy=f"give the name of a folder{bag}",
+            )
         check_folder(out)
         if force or not out.is_dir():
             return

@@ -37,6 +37,7 @@ def fit(
     parameter files and logs give the same policy file, byte for byte.
 
     Example: terrafusion policy fit --out policy.yaml
+
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
 
     Args:

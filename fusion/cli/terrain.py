@@ -42,6 +42,7 @@ def train(
     the same command continues.
 
     Example: terrafusion terrain train --out model.yaml
+
     Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
     common.check_backend(backend, address)
@@ -93,7 +94,9 @@ def evaluate(
     these logs, which must not be those of its training.
 
     Example: terrafusion terrain eval
+
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
+
     Example: terrafusion terrain eval --model grounds.yaml another_day/*/imu_*.csv
 
     Args:

@@ -105,6 +105,9 @@ class EstimatorConfig:
         return self.start_without_gnss_s if self.inputs.gnss else 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.rig, Rig):
+            remedy = "give Vehicle.load(NAME).rig(), or use Estimator.for_vehicle(NAME)"
+            raise ConfigError(f"a {type(self.rig).__name__} is no rig", remedy=remedy)
         for what, value, known in (
             ("mode", self.mode, MODES),
             ("robust_loss", self.robust_loss, ROBUST_LOSSES),
@@ -117,3 +120,17 @@ class EstimatorConfig:
                 checked_number(value, range_, file="the estimator", key=key)
         if self.lag_s < 5 * self.keyframe_s:
             raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")
+
+
+def checked_config(config: object) -> EstimatorConfig:
+    """The configuration.
+
+    Raises:
+        ConfigError: it is none, such as the name of a vehicle.
+    """
+    if isinstance(config, EstimatorConfig):
+        return config
+    raise ConfigError(
+        f"a {type(config).__name__} is no configuration",
+        remedy="give an EstimatorConfig, or use Estimator.for_vehicle(NAME)",
+    )

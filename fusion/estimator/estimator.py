@@ -23,7 +23,7 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
 from terrafusion.datasets.core.robot import SKIDDING
-from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig, checked_config
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
@@ -98,7 +98,7 @@ class Estimator:
         on_innovation: Callable[[Innovation], None] | None = None,
         archive: Chain | None = None,
     ) -> None:
-        rig, policy = config.inputs.rig(config.rig), policy_of(config.rig, config.policy)
+        rig, policy = checked_config(config).inputs.rig(config.rig), policy_of(config.rig, config.policy)
         self.config = dataclasses.replace(config, rig=rig, policy=policy)
         self._on_state, self._on_innovation, self.breakdowns = on_state, on_innovation, 0
         self.reset(archive)

@@ -48,7 +48,7 @@ def calibrate(
     logs: Log | Sequence[Log],
     vehicle: str | Path | VehicleParams = "elevate",
     soils: Soils = None,
-    parameters: Sequence[str] = PARAMETERS,
+    parameters: str | Sequence[str] = PARAMETERS,
     *,
     priors: Mapping[str, Prior] | None = None,
     effects: Mapping[str, float] | None = None,

@@ -76,13 +76,17 @@ def _no_soil(label: str, recording: Recording) -> DataError:
     return DataError(what, file=recording.name, channel="terrain", remedy="name the soil with --terrain")
 
 
-def coordinates_of(names: Sequence[str], model: Model, priors: Mapping[str, Prior]) -> list[Coordinate]:
+def coordinates_of(names: str | Sequence[str], model: Model, priors: Mapping[str, Prior]) -> list[Coordinate]:
     """The named parameters as the solver sees them, `soil.` standing for every ground.
 
     Raises:
         ConfigError: an unknown name, or a prior of a parameter that is not calibrated.
     """
-    numbers: dict[str, Quantity] = resolve(tuple(names), model)
+    numbers: dict[str, Quantity] = resolve((names,) if isinstance(names, str) else tuple(names), model)
+    for name, prior in priors.items():
+        if not isinstance(prior, Prior):
+            remedy = "give a Prior(value, sigma) of terrafusion.twin.calibrate.coordinates"
+            raise ConfigError(f"the prior of '{name}' is {prior!r}", remedy=remedy)
     full = {k: v for name, v in priors.items() for k in model.full_names(name)}
     if unknown := set(full) - set(numbers):
         raise ConfigError(

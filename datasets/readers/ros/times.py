@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together, sorting
@@ -140,13 +141,19 @@ def _leaps(headed: Times, beside: Times) -> list[str]:
 
 def _refuse_zeros(stream: Stream, header_ns: TimesNs) -> None:
     zero = np.flatnonzero(header_ns == 0)
-    if zero.size:
+    if zero.size and not _starts_at_zero(header_ns, zero):
         raise DataError(
             f"{zero.size} of {len(stream)} header stamps are zero",
             channel=stream.topic,
             time_s=_since(stream, int(zero[0])),
             remedy=RECEIPT,
         )
+
+
+def _starts_at_zero(header_ns: TimesNs, zero: NDArray[np.int64]) -> bool:
+    """Whether stamps of zero, in these rows, are times: the first ones of a simulated clock."""
+    first = zero.size == zero[-1] + 1 < len(header_ns)
+    return bool(first and 0 < header_ns[zero.size] < CLOCK_TOLERANCE_S * 1e9)
 
 
 def _refuse_backwards(stream: Stream, t_ns: TimesNs, which: str, remedy: str) -> None:

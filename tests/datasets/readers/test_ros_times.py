@@ -176,3 +176,11 @@ def test_a_merged_bag_is_read_in_the_order_of_receipt(tmp_path: Path) -> None:
     recording = open_recording(write_ros2(tmp_path / "a", [*rows[200:], *rows[:200]]))
     assert recording.imu is not None
     assert recording.imu.t_ns.tolist() == [T0 + i * 10 * MS for i in range(400)]
+
+
+def test_a_simulated_clock_may_start_at_zero(tmp_path: Path) -> None:
+    kind = TYPES["/imu"]
+    messages = [("/imu", kind, T0 + k * 10 * MS, MAKE1.imu(k * 10 * MS)) for k in range(100)]
+    recording = open_recording(write_ros1(tmp_path / "a.bag", messages))
+    assert recording.imu is not None
+    assert recording.imu.t_ns.tolist() == [k * 10 * MS for k in range(100)]

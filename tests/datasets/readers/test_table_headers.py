@@ -73,3 +73,10 @@ def test_a_comma_between_words_is_no_decimal_comma(tmp_path: Path) -> None:
     recording = open_recording(table(tmp_path, "t;wz;ground\n0.5;1;mud, wet\n", columns))
     assert recording.terrain is not None
     assert recording.terrain.label[0] == "mud, wet"
+
+
+def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "excel.csv"
+    path.write_text("t_s,speed_mps\n0,1\n", encoding="utf-16")
+    with pytest.raises(DataError, match=r"excel\.csv: is text in UTF-16; save it as UTF-8"):
+        open_recording(path)

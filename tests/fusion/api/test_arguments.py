@@ -89,6 +89,32 @@ def test_what_is_no_log_is_refused(wrong: Any) -> None:
         tf.replay(wrong)
 
 
+def test_one_name_needs_no_list(log: tf.Recording, tmp_path: Path) -> None:
+    name = "vehicle.wheel.radius_m"
+    assert tf.calibrate(log, parameters=name)[name].value == tf.calibrate(log, parameters=[name])[name].value
+    with pytest.raises(tf.ConfigError, match="unknown effect 'wheels'"):
+        tf.diagnose(log, effects="wheels")
+    with pytest.raises(tf.ConfigError, match="unknown family 'mixd'"):
+        tf.benchmark(tmp_path, only="mixd")
+
+
+def test_a_prior_is_no_number(log: tf.Recording) -> None:
+    with pytest.raises(tf.ConfigError, match=r"'vehicle.wheel.radius_m' is 0.17; give a Prior\(value"):
+        tf.calibrate(log, parameters="vehicle.wheel.radius_m", priors={"vehicle.wheel.radius_m": 0.17})  # type: ignore[dict-item]
+
+
+def test_an_estimator_takes_a_configuration_and_that_a_rig() -> None:
+    with pytest.raises(tf.ConfigError, match=r"a str is no configuration.*Estimator\.for_vehicle"):
+        tf.Estimator("husky")  # type: ignore[arg-type]
+    with pytest.raises(tf.ConfigError, match=r"a VehicleParams is no rig; give Vehicle\.load"):
+        tf.EstimatorConfig(tf.Vehicle.load("husky"))  # type: ignore[arg-type]
+
+
+def test_a_policy_is_fitted_to_one_drive_at_least(tmp_path: Path) -> None:
+    with pytest.raises(tf.ConfigError, match="0 seeds; give a whole number from 1"):
+        tf.policy.fit(tmp_path / "policy.yaml", seeds=0)
+
+
 def test_topics_are_a_mapping(tmp_path: Path) -> None:
     bag = write_ros1(tmp_path / "a.bag", imu_messages(MAKE1))
     with pytest.raises(tf.DataError, match=r"topics is 'imu=/imu/data'; give \{'imu'"):

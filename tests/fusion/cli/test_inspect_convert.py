@@ -303,3 +303,14 @@ def test_wrong_usage_is_status_2(
     log: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(capsys, "inspect", log, *words)[0] == 2
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.db3", "drive.csv.gz"])
+def test_a_folder_with_the_name_of_a_file_is_not_written(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    status, _, err = run(capsys, "convert", log, tmp_path / name)
+    ending = Path(name).suffix
+    assert status == 1
+    assert f"{name}: a folder is written, no {ending} file; give the name of a folder, or of a file" in err
+    assert not (tmp_path / name).exists()
