@@ -1,8 +1,8 @@
 """Sensor configuration: the channels of a log, and the graph that follows from them.
 
-A log with all six IMU axes gets the full graph. Otherwise the robot is taken to drive on level ground (the
-planar graph, `graph/planar.py`): yaw from the gyro's z axis, else from the difference of the wheels, else
-from GNSS alone. Notes tell which.
+A log with all six IMU axes, fast enough to be integrated, gets the full graph. Otherwise the robot is taken
+to drive on level ground (the planar graph, `graph/planar.py`): yaw from the gyro's z axis, else from the
+difference of the wheels, else from GNSS alone. Notes tell which.
 """
 
 import dataclasses
@@ -24,6 +24,10 @@ SKID_YAW_RATIO = 0.6
 (`docs/explanation/planar.md`). Wheels that roll turn the robot by the geometry."""
 COMPLETE_SHARE = 0.5
 """Least share of IMU samples with all six axes for which the log counts as a six-axis one."""
+
+
+LEAST_ACCEL_HZ = 18.0
+"""Slower accelerations are not integrated: a sample of a vibrating robot is no mean over its interval."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,8 @@ def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
     steered = steering is not None and bool(np.isfinite(steering.angle_rad).all(axis=1).any())
     of_wheel = steered and steering is not None and steering.names == ("steering_wheel",)
     sides = wheels is None or wheels.has_sides()
-    return SensorConfig(imu_kind(recording.imu), sides, fixes, steered, of_wheel)
+    imu = "gyro_z" if _is_slow(recording.imu) else imu_kind(recording.imu)
+    return SensorConfig(imu, sides, fixes, steered, of_wheel)
 
 
 def complete_samples(imu: Imu, kind: str) -> np.ndarray:
@@ -144,6 +149,14 @@ def imu_kind(imu: Imu | None) -> str:
         return "none"
     six, z = int(complete_samples(imu, "six_axis").sum()), int(complete_samples(imu, "gyro_z").sum())
     return "six_axis" if six >= COMPLETE_SHARE * z else "gyro_z"
+
+
+def _is_slow(imu: Imu | None) -> bool:
+    """Whether a six-axis IMU has too few samples to integrate its accelerations."""
+    if imu is None or imu_kind(imu) != "six_axis":
+        return False
+    t_ns = imu.t_ns[complete_samples(imu, "six_axis")]
+    return len(t_ns) > 1 and float(np.median(np.diff(t_ns))) > 1e9 / LEAST_ACCEL_HZ
 
 
 def _missing(imu: Imu | None) -> str:
@@ -163,6 +176,8 @@ def _missing(imu: Imu | None) -> str:
             for axis, absent in zip("xyz", absent_accel.tolist(), strict=True)
             if absent
         ]
+    if _is_slow(imu):
+        return f"the accelerometer has fewer than {LEAST_ACCEL_HZ:g} samples a second, too few to integrate"
     if names:
         return f"the log has no {', no '.join(names)}"
     return "few rows of the IMU hold all six axes"

@@ -40,6 +40,18 @@ def test_an_outage_with_slow_sensors_is_as_good_as_the_sensors(rate_hz: float) -
     assert scored.percent < 6.0
 
 
+@pytest.mark.parametrize(("rate_hz", "planar"), [(5, True), (10, True), (17, True), (20, False)])
+def test_accelerations_of_a_slow_imu_do_not_carry_the_robot_away(rate_hz: int, planar: bool) -> None:
+    """Every so many samples of 100 Hz, as a throttled topic has them: each with its vibration in full."""
+    run = simulate("figure_eight", terrain="asphalt", seed=1)
+    assert run.imu is not None
+    slow = dataclasses.replace(run, imu=run.imu.select(slice(0, None, round(100 / rate_hz))))
+    result = replay(slow, outages=[Outage(40.0, 30.0)])
+    assert result.scores.ate_m is not None
+    assert result.scores.ate_m < 0.25
+    assert any("too few to integrate: a planar graph" in note for note in result.estimate.notes) is planar
+
+
 def test_limits_follow_the_interval_of_a_stream() -> None:
     at_1_hz, at_100_hz = (list(range(0, 40 * step, step)) for step in (10**9, 10**7))
     assert usual_interval_s(at_1_hz) == 1.0
