@@ -12,7 +12,7 @@ from terrafusion.datasets.core.scratch import UNFINISHED, is_part
 
 ROOT = Path("terrafusion-out")
 LOG_FILES = ("meta.yaml", "*.csv", "*.csv.gz")
-FILE_ENDINGS = (".bag", ".db3", ".csv", ".gz", ".zip", ".json", ".yaml", ".yml", ".html")
+OTHER_LOGS = (".bag", ".db3", ".csv", ".gz", ".zip")
 FORCED = "give another name, or --force to replace it"
 
 
@@ -53,13 +53,9 @@ class Output:
         return out
 
     def _check_folder(self, out: Path, force: bool) -> None:
-        if out.suffix in FILE_ENDINGS and not out.is_dir():
-            bag = ", or of a file ending in .mcap" if set(LOG_FILES) <= {*self.names} else ""
-            raise TerrafusionError(
-                f"a folder is written, no {out.suffix} file",
-                file=out,
-                remedy=f"give the name of a folder{bag}",
-            )
+        if out.suffix in OTHER_LOGS and set(LOG_FILES) <= {*self.names} and not out.is_dir():
+            remedy = "give the name of a folder, or of a file ending in .mcap"
+            raise TerrafusionError(f"a folder is written, no {out.suffix} file", file=out, remedy=remedy)
         check_folder(out)
         if force or not out.is_dir():
             return

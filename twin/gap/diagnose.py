@@ -35,8 +35,8 @@ STRICTER = 0.2
 """On drives unlike the references', or ground patchier than theirs, the p-value must be below such a share of
 the significance (assumed): how wrong laws are there is no more than assumed."""
 TOO_FEW = (
-    "{} reference run(s) are too few, {} show how runs scatter: twin replicates stand in, and false alarms "
-    "are as frequent as the twin is wrong (uncalibrated)"
+    "{} reference runs, of at least {} that show how runs scatter: twin replicates stand in, and false "
+    "alarms are as frequent as the twin is wrong (uncalibrated)"
 )
 
 

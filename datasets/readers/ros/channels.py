@@ -48,6 +48,8 @@ NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
 FIX_OF_STATUS = {1: Fix.DGPS, 2: Fix.FIXED}
 MOVING_MPS = 0.05
+SIDEWAYS_SHARE = 0.5
+"""Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
 
 
 @dataclass
@@ -165,10 +167,19 @@ class ChannelBuilder:
         self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
         if stream.msgtype == topics.TWIST:
             self.notes.append(f"wheels: {stream.topic} has no stamps; its times are those of arrival")
+        sideways = float(np.nanstd(twist[:, 1])) if len(twist) > 1 else 0.0
+        if sideways > SIDEWAYS_SHARE * np.nanstd(v) and sideways > MOVING_MPS:
+            self.notes.append(
+                f"wheels: {stream.topic} moves sideways as much as forward: its twist seems to be in the "
+                "frame of its pose, not in the robot's; its speeds are then wrong"
+            )
         if stream.msgtype == topics.ODOMETRY and not twist.any():
             position, _, _ = poses(stream)
             if np.nanmax(np.ptp(position[:, :2], axis=0), initial=0.0) > 1.0:
-                self.notes.append(f"wheels: {stream.topic} moves but its twist is zero throughout; left out")
+                self.notes.append(
+                    f"wheels: {stream.topic} moves but its twist is zero throughout; left out: record its "
+                    "speeds, or name another topic with --topic wheels=TOPIC"
+                )
                 return None, None
         if self._says_no_yaw(stream, rate, variance[:, 5], v, imu):
             return Wheels(t_ns, v[:, None], ("speed",), "mps"), None

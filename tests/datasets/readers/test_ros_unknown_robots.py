@@ -111,6 +111,18 @@ def test_a_plain_twist_is_used_where_it_is_asked_for(tmp_path: Path) -> None:
     assert "wheels: /speed has no stamps; its times are those of arrival" in asked.notes
 
 
+@pytest.mark.parametrize(("frame", "noted"), [("odom", True), ("base_link", False)])
+def test_a_twist_in_the_frame_of_the_pose_is_noted(tmp_path: Path, frame: str, noted: bool) -> None:
+    messages = []
+    for k in range(100):
+        yaw = 0.05 * k if frame == "odom" else 0.0
+        message = MAKE2.odometry(T0 + k * 50_000_000, np.cos(yaw), 1.0)
+        message.twist.twist.linear.y = np.sin(yaw)
+        messages.append(message)
+    recording = open_recording(bag_beside_imu(tmp_path / "bag", "/odom", "nav_msgs/msg/Odometry", *messages))
+    assert any("seems to be in the frame of its pose" in note for note in recording.notes) is noted
+
+
 def test_inspect_and_init_say_what_a_bag_lacks(tmp_path: Path) -> None:
     messages = [MAKE2.joints(T0, ["j1", "j2"], [], [1.0, 2.0]) for _ in range(20)]
     bag = bag_beside_imu(tmp_path / "bag", "/base/joints", JOINTS, *messages)
