@@ -32,6 +32,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot skidded, with a friction limit of {friction.mps2:.1f} m/s2")
+    if found := estimator.weights.found_grounds():
+        notes.append("grounds found while driving, with their slip: " + ", ".join(found))
     if level := estimator.learned.mounting.level.note():
         notes.append(level)
     if estimator.imu.spikes:

@@ -50,6 +50,13 @@ class GroundMemory:
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
 
+    def __repr__(self) -> str:
+        """A line a ground."""
+        lines = [
+            f"  {g.name}: slip {float(g.motion.mean[0]):.2f}, {0.5 * g.windows:.0f} s" for g in self.grounds
+        ]
+        return "\n".join([f"GroundMemory({self.robot!r}, {len(lines)} grounds)", *lines])
+
     def __len__(self) -> int:
         return len(self.grounds)
 

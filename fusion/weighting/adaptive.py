@@ -108,6 +108,18 @@ class TerrainNoise:
         """What the ground memory holds by now, condensed; None where there is none."""
         return None if self.grounds is None else self.grounds.memory.condensed()
 
+    def found_grounds(self) -> list[str]:
+        """Name and slip of the grounds whose own slip the estimate expects, where there are several."""
+        if self.grounds is None or not (self.adaptive and self._starts_pooled):
+            return []
+        names = [ground.name for ground in self.grounds.memory.grounds]
+        slips = [
+            (name, slip)
+            for name, slip in zip(names, self._ground_slip.known(), strict=False)
+            if slip is not None
+        ]
+        return [f"{name} {slip:.2f}" for name, slip in slips] if len(slips) > 1 else []
+
     def record(self, change: WeightChange) -> None:
         """Record a change that another part made."""
         self.changes.append(change)
@@ -266,14 +278,22 @@ class TerrainNoise:
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = vars(self._recorded), vars(self.noise)
-        best = int(p.argmax())
-        why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
+        why = self._ground_now(p)
         for name, (sensor, unit) in _RECORDED.items():
             scale = max(abs(before[name]), 0.02)
             if abs(now[name] - before[name]) > NOTEWORTHY * scale:
                 reason = f"{name}: {why}"
                 self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
                 self._recorded = dataclasses.replace(self._recorded, **{name: now[name]})
+
+    def _ground_now(self, p: Array) -> str:
+        """The most probable ground: a class, by their probabilities (k,), or one that the robot has found."""
+        best = int(p.argmax())
+        found = self.grounds.memory if self.grounds and self._starts_pooled else GroundMemory()
+        own, by_label = int(found.belief.argmax()), self._label_probabilities is not None
+        if own and not by_label and self.detector.classes[best] == UNKNOWN:
+            return f"{found.grounds[own - 1].name} p = {found.belief[own]:.2f} (found while driving)"
+        return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
 
 
 def _weighting_for(config: EstimatorConfig, noise: NoiseInForce) -> Weighting:

@@ -90,11 +90,15 @@ class DrivenSlip:
 
     def posterior(self) -> tuple[Array, Array]:
         """Mean and 1 sigma (k,) of the slip to expect on each ground."""
-        prior, seen, variance = self.prior, self._known > 0.0, self._variance()
-        share = np.where(seen, prior.between**2 / (prior.between**2 + variance), 0.0)
+        prior, share, variance = self.prior, self.shares(), self._variance()
         spread = (PRIOR_SPREAD * prior.within**2 + self._square) / (PRIOR_SPREAD + self._count)
         sigma = np.sqrt(spread + share * variance)
-        return prior.mean + share * (self._mean - prior.mean), np.where(seen, sigma, prior.sigma)
+        return prior.mean + share * (self._mean - prior.mean), np.where(share > 0.0, sigma, prior.sigma)
+
+    def shares(self) -> Array:
+        """How far (k,) what the drive has shown counts against what was expected, 0 to 1."""
+        between = self.prior.between**2
+        return np.where(self._known > 0.0, between / (between + self._variance()), 0.0)
 
     def contradicted(self, sigmas: float) -> NDArray[np.bool_]:
         """On which grounds (k,) the slip of the drive is so many sigmas from what was expected."""

@@ -23,6 +23,8 @@ WITHIN, TIME_S = 0.04, 5.0
 """1 sigma of the slip on one ground during a drive, and how long it lasts: those of sand in the policy."""
 BETWEEN_DRIVES = 0.03
 """1 sigma of the mean slip of one ground between drives: weather, load and tyre pressure (assumed)."""
+CLEAR = 0.5
+"""Share of what a drive has shown in the slip that is expected, from which that is the ground's own."""
 STALE = 3.0
 """Sigmas by which the slip of the drive contradicts that of earlier ones, which is then forgotten."""
 
@@ -78,6 +80,11 @@ class GroundSlip:
         if stale:
             self._known = {i: ground for i, ground in self._known.items() if i not in stale}
             self.expect(*self._whole)
+
+    def known(self) -> list[float | None]:
+        """Slip of each ground in the order of the memory; None where the drive has not shown it clearly."""
+        means, shares = self._slip.posterior()[0].tolist(), self._slip.shares().tolist()
+        return [mean if share > CLEAR else None for mean, share in zip(means[1:], shares[1:], strict=True)]
 
     def take_switch(self) -> float:
         """Share of the slip to renew: 0 where it follows the mean that is now expected, 1 where that mean

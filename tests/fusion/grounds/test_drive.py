@@ -106,8 +106,13 @@ def test_a_ground_met_again_in_an_outage_slips_as_it_did_before() -> None:
         if state.status == "outage":
             slips.setdefault(labels.at(state.t_ns), []).append(estimator.weights.noise.slip_mean)
 
-    end_m = replay(log, outages=[Outage(125.0, 50.0)], watch=watch).scores.outages[0].end_error_m
+    result = replay(log, outages=[Outage(125.0, 50.0)], watch=watch)
+    end_m = result.scores.outages[0].end_error_m
     assert end_m is not None
     assert end_m < 1.0  # 2 % of the path; the slip of the whole drive alone would be off by 7 %
     assert np.median(slips["loose_sand"]) == pytest.approx(0.14, abs=0.04)
     assert np.median(slips["asphalt"]) == pytest.approx(0.0, abs=0.02)
+    assert any(note.startswith("grounds found while driving") for note in result.estimate.notes)
+    reasons = {change.reason.partition(": ")[2] for change in result.estimate.changes}
+    assert any(reason.endswith("(found while driving)") for reason in reasons)
+    assert f"{len(result.grounds or ())} grounds" in repr(result.grounds)
