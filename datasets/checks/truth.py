@@ -111,7 +111,8 @@ def check_frame(context: CheckContext) -> Iterator[Finding]:
     known = np.isfinite(truth.position_m[:, :2]).all(axis=1)
     t_ns, place = truth.t_ns[known], on_plane(truth.position_m[known])
     first, last = (int(t_ns[0]), int(t_ns[-1])) if len(t_ns) else (0, -1)
-    fixes = gnss.select((gnss.t_ns >= first) & (gnss.t_ns <= last) & (gnss.fix != Fix.NONE))
+    during = (gnss.t_ns >= first) & (gnss.t_ns <= last) & (gnss.fix != Fix.NONE)
+    fixes = gnss.select(during & np.isfinite(gnss.enu_m[:, :2]).all(axis=1))
     if len(fixes) < LEAST_FIXES:
         return
     there = np.interp((fixes.t_ns - first).astype(float), (t_ns - first).astype(float), place)

@@ -71,7 +71,7 @@ BAD_META: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "meta: aliases that blow up": (meta(f"{BOMB}]", drop="description"), ("meta.yaml", "aliases")),
     "meta: alias of itself": (
         meta("description: &a [*a]", drop="description"),
-        ("meta.yaml", "line", "'*a' stands for nothing"),
+        ("meta.yaml", "line", "inside itself"),
     ),
     "meta: merge keys": (
         meta("a: &a {b: 1}", "c: {<<: *a}"),
