@@ -37,7 +37,7 @@ class TerrainDetector:
                 remedy="mend the policy",
             )
         self.classes = classes
-        self._table = LikelihoodTable(model, classes)
+        self._table, self._by_vibration = LikelihoodTable(model, classes), not model.slip_only
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
 
     @property
@@ -50,7 +50,7 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            self._filter.update(self._table.evaluate(*extract(window)))
+            self._filter.update(self._table.evaluate(*extract(window, self._by_vibration)))
         return self.probabilities
 
     def fuse(self, probabilities: ArrayLike) -> Array:

@@ -74,17 +74,19 @@ class Window:
         return float(max(known, default=0.0))
 
 
-def extract(window: Window) -> tuple[Array, Array]:
+def extract(window: Window, vibration: bool = True) -> tuple[Array, Array]:
     """Features (7,) in the order of `FEATURES`, and the measurement variance (7,) of each.
 
-    Variances are those of slip and yaw slip; the scatter of vibration is part of the class densities.
+    Variances are those of slip and yaw slip; the scatter of vibration is part of the class densities. Where
+    nobody asks for `vibration`, it is NaN.
     """
     values = np.full(len(FEATURES), np.nan)
     variances = np.zeros(len(FEATURES))
     if not window.ground_speed_mps() > MIN_SPEED_MPS:
         return values, variances
-    values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
-    values[:SLIP] -= 0.5 * np.log10(window.ground_speed_mps())
+    if vibration:
+        values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
+        values[:SLIP] -= 0.5 * np.log10(window.ground_speed_mps())
     wheel = window.wheel_speed_mps
     if window.slip is not None and window.slip_sigma is not None and abs(wheel) > MIN_SPEED_MPS:
         values[SLIP] = np.clip(window.slip, *_SLIP_RANGE)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.bootstrap import percentile_interval
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark import twin_runs
 from terrafusion.fusion.benchmark.methods import true_labels
@@ -89,7 +90,17 @@ def drive_of(setting: Setting, robot: str, seed: int) -> tuple[Recording, Outage
 
 
 def errors_m(trial: tuple[str, str, int]) -> dict[str, float]:
-    """Error at the end of the outage by mode, m: setting, robot and seed."""
+    """Error at the end of the outage by mode, m: setting, robot and seed.
+
+    None where a drive gets stuck before coarse fixes have shown the heading.
+    """
+    try:
+        return _errors_m(trial)
+    except DataError:
+        return {}
+
+
+def _errors_m(trial: tuple[str, str, int]) -> dict[str, float]:
     name, robot, seed = trial
     setting = SETTINGS[name]
     log, outage = drive_of(setting, robot, seed)
@@ -139,10 +150,12 @@ def main() -> None:
         trials = [(name, robot, seed) for robot in robots for seed in range(first, first + given.seeds)]
         errors = answers(trials, errors_m, TaskWorkers.of(given), given.out)
         groups = {robot: errors[i * given.seeds :][: given.seeds] for i, robot in enumerate(robots)}
-        for robot, some in {**groups, "all": errors}.items():
+        for robot, drives in {**groups, "all": errors}.items():
+            some = [one for one in drives if one]
             median = float(np.median([e["fixed"] for e in some]))
             ratios = "".join(f"{ratio(some, mode):20s}" for mode in MODES[1:])
-            print(f"{name + ' ' + robot:28s} {median:9.2f}              {ratios}", flush=True)
+            stuck = f"stuck at the start {len(drives) - len(some)}" if len(some) < len(drives) else ""
+            print(f"{name + ' ' + robot:28s} {median:9.2f}              {ratios}{stuck}", flush=True)
 
 
 if __name__ == "__main__":
