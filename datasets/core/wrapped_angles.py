@@ -30,9 +30,10 @@ def unwrapped(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | 
     for k, name in enumerate(names):
         held = np.isfinite(angle_rad[:, k])
         angle = angle_rad[held, k]
-        steps = np.diff(angle)
+        with np.errstate(over="ignore"):  # no wheel turns so far, and no log that holds it is wrapped
+            steps, range_rad = np.diff(angle), np.ptp(angle) if len(angle) else 0.0
         jumps, large = (np.count_nonzero(np.abs(steps) > share * TURN_RAD) for share in (NEARLY, LARGEST))
-        if not (jumps or large > MOST_LARGE) or np.ptp(angle) > WITHIN * TURN_RAD:
+        if not (jumps or large > MOST_LARGE) or range_rad > WITHIN * TURN_RAD:
             continue
         turns = np.rint(steps / TURN_RAD)
         if (np.abs(steps - TURN_RAD * turns) > LARGEST * TURN_RAD).any():

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +43,9 @@ from terrafusion.datasets.readers.log_meta import parse_meta
 
 PLANAR_TWIST = ("u_mps", "v_mps", "r_radps")
 NUMBERS = ("wheel_radius_m", "track_m", "drive", "wheelbase_m", "steering_ratio")
+
+BLOCK_ROWS = 100_000
+"""Rows that are turned into text at a time, which bounds the memory."""
 
 
 @contextmanager
@@ -266,13 +269,26 @@ def _check_table(table: OutputTable, start_ns: int, folder: Path, channel: str) 
 
 
 def _write_table(path: Path, start_ns: int, table: OutputTable) -> None:
-    """Shortest decimals that read back to the same double; an empty cell for NaN."""
-    import pandas as pd
+    """By blocks of rows, twice as fast as pandas, which leaves a carriage return in a text unquoted."""
+    with path.open("w", encoding="utf-8", newline="") as out:
+        out.write(",".join(["t_s", *_quoted(list(table.columns))]) + "\n")
+        for first in range(0, len(table.t_ns), BLOCK_ROWS):
+            rows = slice(first, first + BLOCK_ROWS)
+            since_start = table.t_ns[rows] - np.int64(start_ns)
+            cells = [decimal_seconds(since_start), *(_cells(c[rows]) for c in table.columns.values())]
+            out.write("\n".join(map(",".join, zip(*cells, strict=True))) + "\n")
 
-    t_s = decimal_seconds(table.t_ns - np.int64(start_ns))
-    columns = {n: c.astype(float if c.dtype.kind == "f" else object) for n, c in table.columns.items()}
-    frame = pd.DataFrame({"t_s": np.array(t_s, dtype=object), **columns})
-    frame.to_csv(path, index=False, lineterminator="\n", encoding="utf-8")
+
+def _cells(column: NDArray[Any]) -> list[str]:
+    """Shortest decimals that read back to the same double; empty for NaN."""
+    if column.dtype.kind != "f":
+        return _quoted([str(value) for value in column.tolist()])
+    return repr(column.astype(float).tolist())[1:-1].replace("nan", "").split(", ")
+
+
+def _quoted(texts: Sequence[str]) -> list[str]:
+    special = set(',"\r\n')
+    return [f'"{text.replace(chr(34), chr(34) * 2)}"' if special & set(text) else text for text in texts]
 
 
 def decimal_seconds(t_ns: NDArray[np.int64]) -> list[str]:

@@ -28,6 +28,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump, Overrides, Recording
 from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.core.wrapped_angles import unwrapped
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 from tests.differences import differences
@@ -213,3 +214,18 @@ def test_field_logs_survive_both(name: str, tmp_path: Path) -> None:
     write_mcap(recording, tmp_path / "log.mcap")
     for path in (write_log_folder(recording, tmp_path / "log"), tmp_path / "log.mcap"):
         assert differences(recording, open_recording(path)) == []
+
+
+@pytest.mark.parametrize("label", ["\r", "mud\r\nand snow", 'so-called "mud", wet', "\x85"])
+def test_any_label_survives_the_log_folder(tmp_path: Path, label: str) -> None:
+    terrain = Terrain(np.arange(3) * 10**9, np.array(["mud", label, "snow"], dtype=object))
+    wheels = Wheels(np.arange(3) * 10**9, np.zeros((3, 2)), ("left", "right"), "radps")
+    recording = Recording(name="log", start_ns=0, wheels=wheels, terrain=terrain)
+    back = open_recording(write_log_folder(recording, tmp_path / "log"))
+    assert back.terrain is not None
+    assert back.terrain.label.tolist() == ["mud", label, "snow"]
+
+
+def test_angles_beyond_all_numbers_are_not_wrapped() -> None:
+    angle = np.array([[-1.7e308], [1.7e308], [0.0]])
+    assert unwrapped(angle, ("left",)) == (angle, "")
