@@ -50,7 +50,7 @@ class SignatureExtractor:
         out[7] = _yaw_slip(window)
         out[8] = _surge_share(window)
         out[9] = slide
-        if window.slip is not None and (window.slip_sigma or 0.0) < CLEAR_SLIP:
+        if window.slip is not None and window.slip_sigma is not None and window.slip_sigma < CLEAR_SLIP:
             out[10] = window.slip
         return out
 
