@@ -127,7 +127,8 @@ def ended(child: int, work: Path, kill_cpu_s: float = 0.0, sign: int = signal.SI
             break
         time.sleep(0.005)
     err, count = work / "stderr.txt", work / "events.txt"
-    events = int(count.read_text()) if count.is_file() else 0
+    # Killed while it wrote the count, a child leaves an empty file.
+    events = int(count.read_text() or 0) if count.is_file() else 0
     count.unlink(missing_ok=True)
     code = os.waitstatus_to_exitcode(status)
     said = err.read_text(errors="replace") if err.is_file() else ""
