@@ -17,8 +17,7 @@ from terrafusion.datasets.checks.finding import (
     retimed,
     retiming,
 )
-from terrafusion.datasets.checks.path import path_by
-from terrafusion.datasets.checks.path_model import path_model
+from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
@@ -315,7 +314,7 @@ def _confirms(pair: motion.Pair, lag: Lag, off: dict[motion.Pair, Lag]) -> bool:
 
 def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
-    model = path_model(context, path_by(context.recording, "gnss"))
+    model = model_by_fixes(context)
     if model is None or abs(model.delay_s.value) < LEAST_LATE_S or model.rest > MOST_REST:
         return
     if not model.delay_s.is_beyond(SIGNIFICANT_S):

@@ -7,14 +7,15 @@ weights, their intervals by bootstrap over windows: errors of fixes last for man
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.finding import CheckContext, once
 from terrafusion.datasets.checks.motion import cumulative
-from terrafusion.datasets.checks.path import MeasuredPath, driven_and_turned
+from terrafusion.datasets.checks.path import MeasuredPath, driven_and_turned, path_by
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 
@@ -66,17 +67,25 @@ class _Windows:
         """Median over the windows of the scatter of their positions about the mean."""
         return float(np.median([np.std(self.place[rows]) for rows in self.rows]))
 
+    @functools.cached_property
+    def _measured(self) -> list[Complex]:
+        """Dead reckoning by the gyro as it is, from which all delays are tried."""
+        return self._dead_reckoned(0.0, 0.0)
+
+    def _dead_reckoned(self, scale: float, bias: float) -> list[Complex]:
+        """Path, its derivatives by scale and bias, velocity and heading, each (N,) on the wheels' times."""
+        ahead = np.exp(1j * ((1.0 + scale) * self.turned + bias * self.t))
+        velocity = self.v * ahead
+        rates = velocity, 1j * self.turned * self.v * ahead, 1j * self.t * self.v * ahead
+        return [*(cumulative(self.t, rate) for rate in rates), velocity, ahead]
+
     def steps(self, unknown: Array) -> Iterator[tuple[Array, Array]]:
         """For each window the normal equations of the common unknowns: columns (2n, 5) and residual (2n,)."""
         scale, delay_s, forward, left, bias = unknown.tolist()
         lever = complex(forward, left)
-        ahead = np.exp(1j * ((1.0 + scale) * self.turned + bias * self.t))
-        columns = [self.v * ahead, 1j * self.turned * self.v * ahead, 1j * self.t * self.v * ahead]
-        path, by_scale, by_bias = (cumulative(self.t, column) for column in columns)
+        columns = self._measured if scale == bias == 0.0 else self._dead_reckoned(scale, bias)
         at = self.t_fix - delay_s
-        P, K, B, V, E = (
-            np.interp(at, self.t, column) for column in (path, by_scale, by_bias, columns[0], ahead)
-        )
+        P, K, B, V, E = (np.interp(at, self.t, column) for column in columns)
         for rows in self.rows:
             p, g = P[rows] + lever * E[rows], self.place[rows]
             p, g = p - p.mean(), g - g.mean()
@@ -96,8 +105,19 @@ def _real(columns: Complex) -> Array:
     return np.concatenate([columns.real, columns.imag])
 
 
-def path_model(context: CheckContext, measured: MeasuredPath | None) -> PathModel | None:
-    """Fit it; None where wheels, gyro or windows are too few, or the paths are unlike."""
+@once
+def model_by_fixes(context: CheckContext) -> PathModel | None:
+    """By the path of the fixes; None where wheels, gyro or windows are too few, or the paths are unlike."""
+    return _path_model(context, path_by(context.recording, "gnss"))
+
+
+@once
+def model_by_truth(context: CheckContext) -> PathModel | None:
+    """By the path of the truth; None likewise."""
+    return _path_model(context, path_by(context.recording, "truth"))
+
+
+def _path_model(context: CheckContext, measured: MeasuredPath | None) -> PathModel | None:
     if measured is None:
         return None
     wide = _windows(context, measured, LONGEST_FAR_S)

@@ -9,8 +9,8 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed_field, scaled
 from terrafusion.datasets.checks.motion import common_span, runs, wheel_speed, yaw_angles
-from terrafusion.datasets.checks.path import PathScale, dead_reckoned, measured_paths, path_by, scales
-from terrafusion.datasets.checks.path_model import path_model
+from terrafusion.datasets.checks.path import PathScale, dead_reckoned, measured_paths, scales
+from terrafusion.datasets.checks.path_model import model_by_fixes, model_by_truth
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 from terrafusion.datasets.core.channels import TERRAINS
@@ -206,8 +206,9 @@ def _by_truth(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
 
 
 def _by_path(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
-    for source, name in (("gnss", "the path of the fixes"), ("truth", "the path of the truth")):
-        model = path_model(context, path_by(context.recording, source))
+    paths = (model_by_fixes, "the path of the fixes"), (model_by_truth, "the path of the truth")
+    for model_by, name in paths:
+        model = model_by(context)
         if model is not None and model.windows >= PATH_WINDOWS:
             return model.gyro_scale, name
     return None

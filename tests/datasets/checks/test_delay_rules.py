@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import delays
+from terrafusion.datasets.checks import delays, path_model, scale
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import Pair, Signal
-from terrafusion.datasets.checks.path_model import path_model
+from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
@@ -108,8 +108,7 @@ def test_late_fixes(
     drive: Recording, monkeypatch: pytest.MonkeyPatch, value: float, low: float, high: float, words: str
 ) -> None:
     model = SimpleNamespace(delay_s=BootstrapInterval(value, low, high), windows=17, rest=0.9)
-    monkeypatch.setattr(delays, "path_by", lambda *_: object())
-    monkeypatch.setattr(delays, "path_model", lambda *_: model)
+    monkeypatch.setattr(delays, "model_by_fixes", lambda _: model)
     found = list(delays._late_fixes(CheckContext(drive, None)))
     assert [finding.what for finding in found] == (
         [f"its times are {words} against wheels and imu"] if words else []
@@ -124,9 +123,19 @@ def test_late_fixes(
         assert not list(delays._late_fixes(CheckContext(drive, None))), "no delay fits as well"
         assert drive.gnss is not None
         np.testing.assert_array_equal(moved.t_ns, drive.gnss.t_ns - round(value * 1e9))
-    monkeypatch.setattr(delays, "path_by", lambda *_: None)
-    monkeypatch.setattr(delays, "path_model", path_model)
-    assert not list(delays._late_fixes(CheckContext(drive, None)))
+    monkeypatch.setattr(delays, "model_by_fixes", model_by_fixes)
+    assert not list(delays._late_fixes(CheckContext(dataclasses.replace(drive, gnss=None), None)))
+
+
+def test_the_path_of_the_fixes_is_fitted_once_for_all_checks(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[object] = []
+    monkeypatch.setattr(path_model, "_path_model", lambda _, measured: fitted.append(measured))
+    context = CheckContext(dataclasses.replace(drive, truth=None), None)
+    for check in (delays._late_fixes, scale.check_gyro_scale):
+        assert not list(check(context))
+    assert len([measured for measured in fitted if measured is not None]) == 1
 
 
 def test_delays_that_the_vehicle_file_has_are_taken_out_first(

@@ -291,8 +291,8 @@ def test_a_path_of_few_stretches_tells_none(
     drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, used: str | None
 ) -> None:
     error = BootstrapInterval(0.05, 0.04, 0.06)
-    models = {"gnss": None, "truth": SimpleNamespace(windows=windows, gyro_scale=error)}
-    monkeypatch.setattr(scale, "path_by", lambda _, source: source)
-    monkeypatch.setattr(scale, "path_model", lambda _, path: models[path])
+    model = SimpleNamespace(windows=windows, gyro_scale=error)
+    monkeypatch.setattr(scale, "model_by_fixes", lambda _: None)
+    monkeypatch.setattr(scale, "model_by_truth", lambda _: model)
     found = scale._by_path(CheckContext(drive, None))
     assert found == (None if used is None else (error, used))
