@@ -32,22 +32,41 @@ def to_ns(texts: Sequence[str], unit: str = "s") -> NDArray[np.int64]:
     Raises:
         NotADecimal: a text is no finite decimal number, or beyond int64.
     """
-    return np.array([_one_to_ns(text, NS_PER[unit], row) for row, text in enumerate(texts)], dtype=np.int64)
+    ns = NS_PER[unit]
+    places = len(str(ns)) - 1
+    return np.array([_one_to_ns(text, ns, places, row) for row, text in enumerate(texts)], dtype=np.int64)
 
 
-def _one_to_ns(text: str, ns: int, row: int) -> int:
+def _one_to_ns(text: str, ns: int, places: int, row: int) -> int:
     if len(text) > MAX_CHARACTERS or "_" in text or not text.isascii():
         raise NotADecimal(row)
+    whole = _plain_to_ns(text, places)
+    if whole is None:
+        whole = _any_to_ns(text, ns, row)
+    if abs(whole) > _LIMIT_NS:
+        raise NotADecimal(row)
+    return whole
+
+
+def _plain_to_ns(text: str, places: int) -> int | None:
+    """A number without exponent that is whole nanoseconds, as most are; None for any other text."""
+    before, _, after = text.partition(".")
+    if len(after) > places or not (after or before[-1:]).isdigit():
+        return None
+    try:
+        return int(before + after.ljust(places, "0"))
+    except ValueError:
+        return None
+
+
+def _any_to_ns(text: str, ns: int, row: int) -> int:
     try:
         number = Decimal(text)
         if not number.is_finite() or number.adjusted() > 20:
             raise NotADecimal(row)
-        whole = int((number * ns).to_integral_value(rounding=ROUND_HALF_EVEN))
+        return int((number * ns).to_integral_value(rounding=ROUND_HALF_EVEN))
     except ArithmeticError:
         raise NotADecimal(row) from None
-    if abs(whole) > _LIMIT_NS:
-        raise NotADecimal(row)
-    return whole
 
 
 def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
