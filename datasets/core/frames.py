@@ -34,7 +34,11 @@ def quaternion_to_matrix(q_xyzw: ArrayLike) -> Array:
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    R = np.empty((*x.shape, 3, 3))
+    for i, row in enumerate(rows):  # np.stack takes longer than all the rest
+        for j, values in enumerate(row):
+            R[..., i, j] = values
+    return R
 
 
 def matrix_to_quaternion(R: ArrayLike) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,10 +79,12 @@ class Knowledge:
     slip_time_s: float
     misfit: float = 1.0
 
-    @property
+    @functools.cached_property
     def sigma(self) -> Array:
-        """1 sigma (8,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        """1 sigma (8,), read-only."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        sigma.flags.writeable = False
+        return np.asarray(sigma)
 
     def outwards(self) -> Knowledge:
         """With a course lag that is not negative: a robot that skids in a turn is carried outwards.
@@ -142,7 +145,7 @@ def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
 
     `yaw` is the source of the yaw rate, as of `SensorConfig`.
     """
-    mean, sigma, change = wide.mean.copy(), wide.sigma, _change_sigma(yaw)
+    mean, sigma, change = wide.mean.copy(), wide.sigma.copy(), _change_sigma(yaw)
     for row, number in _rows(known, yaw).items():
         in_geometry = row in (ANTENNA_X, ANTENNA_Y) or number is known.yaw_factor  # which holds their values
         mean[row] = 0.0 if in_geometry else number.number

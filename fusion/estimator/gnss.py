@@ -417,7 +417,7 @@ class GnssUpdater:
         if velocity is None or not math.isfinite(float(velocity[0] + velocity[1]) + fix.sigma_v_mps):
             return None
         sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
-        off_mps = math.sqrt(float(np.nansum((velocity - predicted_mps) ** 2)))
+        off_mps = math.sqrt(sum([v * v for v in (velocity - predicted_mps).tolist() if v == v]))
         usable = off_mps <= VELOCITY_OFF_MPS + VELOCITY_OFF_SIGMA * sigma_mps
         self.velocities_refused += not usable
         return velocity if usable else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections import deque
 
 import gtsam
@@ -112,6 +113,7 @@ class LearnedNumbers:
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known, self._skids = prior, config.rig.drive in SKIDDING
         self._place: tuple[Knowledge, PlaceBelief] | None = None
+        self._moments: tuple[Knowledge, Array, float, Array] | None = None  # and of what they were made
         self._before_skid: Knowledge | None = None
         self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
@@ -210,8 +212,11 @@ class LearnedNumbers:
         Of the lag, those on the grounds that were driven; its spread between grounds is in the graph.
         """
         gnss = self._gnss
-        (x_m, y_m, _), late_s = (gnss.antenna_m - gnss.nominal_antenna_m).tolist(), gnss.delay_s
-        return self._moments_about(np.array([x_m, y_m, late_s]))
+        made_of = self._known, gnss.antenna_m, gnss.delay_s
+        if self._moments is None or any(map(operator.is_not, self._moments[:3], made_of)):
+            x_m, y_m, _ = (gnss.antenna_m - gnss.nominal_antenna_m).tolist()
+            self._moments = *made_of, self._moments_about(np.array([x_m, y_m, gnss.delay_s]))
+        return self._moments[3]
 
     def past_place_moments(self, t_ns: TimesNs) -> Array:
         """The same (N, 4) of those that were in use at the times (N,), by what is known now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -79,7 +80,7 @@ def test_a_scale_that_seems_wrong_and_is_not_corrected_is_doubted_by_as_much() -
 def test_a_delay_corrects_from_four_of_its_sigmas_on(sigma_s: float, corrected_s: float) -> None:
     estimator = Estimator.for_vehicle("elevate", "fixed")
     prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
-    mean, sigma = prior.mean.copy(), prior.sigma
+    mean, sigma = prior.mean.copy(), prior.sigma.copy()
     mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.4, sigma_s
     estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03, 300.0), 1)
     assert estimator.gnss.delay_s == pytest.approx(corrected_s)
@@ -235,6 +236,20 @@ def test_a_course_lag_is_doubted_by_its_sigma_and_by_what_is_not_corrected(
     mean[COURSE_LAG] = 0.2
     learned._known = Knowledge(mean, covariance, spread, 300.0)
     assert np.sqrt(learned.place_moments()[-1]) == pytest.approx(np.hypot(SKIDDING_LAG_SIGMA_S, off_s))
+
+
+def test_the_doubt_of_a_place_is_computed_only_where_a_number_has_changed() -> None:
+    learned = Estimator.for_vehicle("husky").learned
+    moments = [learned.place_moments()]
+    assert learned.place_moments() is moments[0]
+    learned._gnss.correct(0, np.array([0.1, 0.0]), 0.0)
+    moments.append(learned.place_moments())
+    learned._gnss.correct(0, np.array([0.1, 0.0]), 0.2)
+    moments.append(learned.place_moments())
+    learned._known = dataclasses.replace(learned._known, covariance=2.0 * learned._known.covariance)
+    moments.append(learned.place_moments())
+    for before, after in itertools.pairwise(moments):
+        assert (before != after).any()
 
 
 def test_an_estimator_that_learns_nothing_of_its_sensors_takes_them_for_exact() -> None:
