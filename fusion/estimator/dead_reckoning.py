@@ -148,12 +148,13 @@ class DeadReckoning:
             self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0, 0.0)
             return
         dt = (node.t_ns - self._t_ns[-1]) * 1e-9
-        moved, known = R.T @ state.velocity * dt, False
         speed_mps = math.sqrt(state.velocity @ state.velocity)
         if node.wheels is not None and math.isfinite(node.wheels.sigma[0]):
             moved, known = node.wheels.displacement_m, not skids
             speed_mps = max(speed_mps, abs(node.wheels.distance_m) / dt)
             self._top_mps = max(self._top_mps, speed_mps)
+        else:
+            moved, known = R.T @ state.velocity * dt, False
         east, north, _ = (R @ moved).tolist()
         turn = float(R[2] @ state.rate(node.gyro_radps)) * dt
         level = complex(east, north) * cmath.exp(-1j * self._yaw_chain)

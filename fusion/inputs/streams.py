@@ -181,19 +181,19 @@ class ImuStream:
                 channel="imu",
                 remedy="leave out samples with missing axes",
             )
-        if beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2):
+        spike = beyond(gyro, SPIN_RADPS), beyond(accel, SHOCK_MPS2)
+        if any(spike) and (beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2)):
             self.impossible += 1
             return
-        for sample in self.late.jump.admitted((t_ns, gyro, accel)):
+        for sample in self.late.jump.admitted((t_ns, gyro, accel, spike)):
             self._insert(*sample)
 
-    def _insert(self, t_ns: int, gyro: Array, accel: Array) -> None:
+    def _insert(self, t_ns: int, gyro: Array, accel: Array, spike: tuple[bool, bool]) -> None:
         for _ in range(self.late.from_future(t_ns, self.t_ns)):
             for values in (self.t_ns, self.gyro, self.accel):
                 values.pop()
         i = self.late.place(t_ns, self.t_ns)
         if i is not None:
-            spike = beyond(gyro, SPIN_RADPS), beyond(accel, SHOCK_MPS2)
             if any(spike):
                 if self._is_spike(i, t_ns):
                     recent = slice(max(i - REPLACED_BY, 0), i)
