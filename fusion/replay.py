@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from terrafusion.datasets.checks import Finding, run_checks
@@ -45,6 +45,7 @@ class ReplayResult:
         assumed: numbers that neither log nor vehicle file tells.
         learned: numbers of the robot as self-calibration knows them at the end.
         grounds: ground memory after the drive; None where the terrain model knows the robot.
+        found_shares: of the time on unknown ground, the share of each ground that the robot found.
     """
 
     recording: Recording
@@ -65,6 +66,7 @@ class ReplayResult:
     assumed: tuple[Assumption, ...]
     learned: tuple[NumberAfterDrive, ...] = ()
     grounds: GroundMemory | None = None
+    found_shares: dict[str, float] = field(default_factory=dict)
 
     def realtime_factor(self) -> float:
         """Seconds of recording per second of computing."""
@@ -120,6 +122,7 @@ def replay(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
         drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
         alone, verdict, drive.assumed, estimator.learned.table(), estimator.weights.learned_grounds(),
+        estimator.weights.found_shares(),
     )  # fmt: skip
 
 

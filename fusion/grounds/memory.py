@@ -69,6 +69,11 @@ class GroundMemory:
     def belief(self, probabilities: Array) -> None:
         self._belief = probabilities.tolist()
 
+    def most_probable(self) -> str:
+        """Name of the ground that the robot most probably is on; "" where it is new."""
+        best = int(self.belief.argmax())
+        return self.grounds[best - 1].name if best else ""
+
     def copy(self) -> "GroundMemory":
         """The same grounds, at the begin of a drive."""
         return GroundMemory(self.grounds, self.robot)

@@ -30,6 +30,7 @@ from terrafusion.fusion.metrics.scores import Scores
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
 from terrafusion.fusion.outputs.linear_states import learned_rows, series
 from terrafusion.fusion.replay import ReplayResult
+from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 SCHEMA = "terrafusion.replay/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")
@@ -50,7 +51,7 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
     latencies = np.asarray(result.latencies_ms, dtype=float).ravel()
     latencies = latencies[np.isfinite(latencies)]
     p50, p99 = np.percentile(latencies, [50.0, 99.0]) if len(latencies) else (0.0, 0.0)
-    shares = terrain_shares(estimate)
+    shares = terrain_shares(estimate, result.found_shares)
     return {
         "schema": SCHEMA,
         "log": result.recording.name,
@@ -87,10 +88,11 @@ def _scored(scores: Scores) -> dict[str, Any]:
     }
 
 
-def terrain_shares(estimate: Estimate) -> dict[str, float]:
+def terrain_shares(estimate: Estimate, found: Mapping[str, float] | None = None) -> dict[str, float]:
     """Share of the drive's time in which each class was the most probable; they sum to 1.
 
-    A keyframe's class holds until the next keyframe; classes that never lead are left out.
+    A keyframe's class holds until the next keyframe; classes that never lead are left out. `found` are the
+    shares of the grounds that the robot found in the time on unknown ground, which they take over.
     """
     t_ns = estimate.trajectory.t_ns
     if not len(t_ns) or not estimate.classes:
@@ -100,7 +102,14 @@ def terrain_shares(estimate: Estimate) -> dict[str, float]:
         seconds = np.ones(len(t_ns))
     label = np.nan_to_num(estimate.terrain).argmax(axis=1)
     total = np.bincount(label, weights=seconds, minlength=len(estimate.classes)) / seconds.sum()
-    return {name: float(share) for name, share in zip(estimate.classes, total, strict=True) if share > 0.0}
+    shares = {name: float(share) for name, share in zip(estimate.classes, total, strict=True) if share > 0.0}
+    unknown = shares.pop(UNKNOWN, 0.0)
+    of_found = {name: share * unknown for name, share in (found or {}).items()}
+    rest = max(unknown - sum(of_found.values()), 0.0)
+    for name, share in {**of_found, UNKNOWN: rest}.items():
+        if share > 0.0:
+            shares[name] = shares.get(name, 0.0) + share
+    return shares
 
 
 def final_status(estimate: Estimate) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """Sensor noise in force by the detected terrain, with a reason for every change."""
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Mapping
 
@@ -15,8 +16,8 @@ from terrafusion.fusion.grounds.learner import FrictionBank, GroundLearner
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import as_numbers
-from terrafusion.fusion.noise.policy import SensorNoise
-from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
+from terrafusion.fusion.noise.policy import Policy, SensorNoise
+from terrafusion.fusion.terrain.classifier import FOREIGN_SLIP, UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, slip_without_prior
 from terrafusion.fusion.weighting.driven_slip import DrivenSlip
@@ -66,9 +67,7 @@ class TerrainNoise:
         learns = config.grounds is not None or (self.adaptive and self._starts_pooled)
         self.grounds = GroundLearner(config.grounds) if learns else None
         if self._starts_pooled:
-            # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
-            classes = {**self.policy.classes, UNKNOWN: fixed}
-            self.policy = dataclasses.replace(self.policy, classes=classes)
+            self.policy = _for_another_robot(self.policy, fixed)
         self._driven = DrivenSlip.of_policy(self.policy)
         self._slips, self._slip_times_s = self._driven.posterior(), self.policy.slips()[3].copy()
         own, known = self.policy.classes[UNKNOWN], config.grounds.grounds if config.grounds else ()
@@ -85,6 +84,7 @@ class TerrainNoise:
         self._before = self._shares
         self._next_ns = self._updated_ns = 0
         self._grade = 0.0
+        self._on_found_s: dict[str, float] = {}
         self._last_speed = np.nan
         self._source = "detector"
 
@@ -120,6 +120,11 @@ class TerrainNoise:
         ]
         return [f"{name} {slip:.2f}" for name, slip in slips] if len(slips) > 1 else []
 
+    def found_shares(self) -> dict[str, float]:
+        """Share of each found ground in the time on ground that no class describes; the rest was new."""
+        total_s = sum(self._on_found_s.values())
+        return {name: s / total_s for name, s in self._on_found_s.items() if name and total_s > 0.0}
+
     def record(self, change: WeightChange) -> None:
         """Record a change that another part made."""
         self.changes.append(change)
@@ -137,7 +142,8 @@ class TerrainNoise:
         p = self._shares
         moved = 0.5 * float(np.abs(p - self._before).sum())
         self._before = p
-        return max(moved, self._ground_slip.take_switch()) if self._starts_pooled else moved
+        found = self._ground_slip.take_switch() if self._starts_pooled else 0.0
+        return max(moved, found * float(p[self.detector.classes.index(UNKNOWN)]))
 
     def begin(self, t_ns: int) -> None:
         """Start the clock; the first noise is a change from the policy's fixed one."""
@@ -193,6 +199,9 @@ class TerrainNoise:
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
             self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
             self._ground_slip.recognise(self.grounds.memory.belief)
+            if self.detector.classes[int(self._probabilities.argmax())] == UNKNOWN:
+                name = self.grounds.memory.most_probable()
+                self._on_found_s[name] = self._on_found_s.get(name, 0.0) + window.dt_s
         self._learn_driven_slip(window)
         self._source = "detector"
         self._apply_labels(state.t_ns)
@@ -205,16 +214,15 @@ class TerrainNoise:
         return dataclasses.replace(window, slip=window.slip - self.noise.slip_per_grade * self._grade)
 
     def _learn_driven_slip(self, window: Window) -> None:
-        """Take the slip of the window for that of its ground, where the model knows the robot's grounds."""
+        """Take the slip of the window for that of its ground."""
         if not self.adaptive or window.slip is None or window.slip_sigma is None:
             return
         if not window.ground_speed_mps() > MIN_SPEED_MPS:
             return
         if self._starts_pooled:
             self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s)
-        else:
-            self._driven.add(self._probabilities, window.slip, window.slip_sigma, self._grade, window.dt_s)
-            self._slips = self._driven.posterior()
+        self._driven.add(self._shares, window.slip, window.slip_sigma, self._grade, window.dt_s)
+        self._slips = self._driven.posterior()
 
     def _apply_labels(self, t_ns: int) -> None:
         """Take the ground from the labels, where there are some; the detector runs on, unused."""
@@ -290,10 +298,23 @@ class TerrainNoise:
         """The most probable ground: a class, by their probabilities (k,), or one that the robot has found."""
         best = int(p.argmax())
         found = self.grounds.memory if self.grounds and self._starts_pooled else GroundMemory()
-        own, by_label = int(found.belief.argmax()), self._label_probabilities is not None
+        own, by_label = found.most_probable(), self._label_probabilities is not None
         if own and not by_label and self.detector.classes[best] == UNKNOWN:
-            return f"{found.grounds[own - 1].name} p = {found.belief[own]:.2f} (found while driving)"
+            return f"{own} p = {found.belief.max():.2f} (found while driving)"
         return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
+
+
+def _for_another_robot(policy: Policy, pooled: SensorNoise) -> Policy:
+    """The policy for a robot on which it was not fitted.
+
+    It is usually on `unknown` ground, which gets the `pooled` noise, not the wider one. Its rolling radius is
+    less well known, which looks like slip on every ground.
+    """
+    doubted = {
+        name: dataclasses.replace(noise, slip_sigma=math.hypot(noise.slip_sigma, FOREIGN_SLIP))
+        for name, noise in policy.classes.items()
+    }
+    return dataclasses.replace(policy, classes={**doubted, UNKNOWN: pooled})
 
 
 def _weighting_for(config: EstimatorConfig, noise: NoiseInForce) -> Weighting:

@@ -18,7 +18,9 @@ from terrafusion.fusion.grounds.file import save_grounds
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import replay
+from terrafusion.fusion.reports.replay_text import summary_of_one
 from terrafusion.twin.model.vehicle import as_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
@@ -41,6 +43,23 @@ def test_a_drive_adds_to_the_memory_and_the_next_one_goes_on(drive: Recording, t
     assert second is not None
     assert len(second) == 1
     assert second.grounds[0].windows > 1.5 * first.grounds[0].windows
+
+
+def test_the_terrain_of_a_drive_is_told_by_the_grounds_that_the_robot_found(drive: Recording) -> None:
+    result = replay(drive)
+    shares = metrics_of(result)["terrain"]
+    assert shares["ground 1"] > 0.7
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert any(f"ground 1 {100 * shares['ground 1']:.0f} %" in s for s in summary_of_one(metrics_of(result)))
+
+
+def test_a_ground_by_its_label_has_the_slip_that_the_robot_shows_on_it(drive: Recording) -> None:
+    """Wheels 6 % smaller than the file says, on asphalt, where the policy's robot slips by 0.1 %."""
+    radius_m = 1.06 * as_vehicle("husky").rig().wheel_radius_m
+    worn = dataclasses.replace(drive, overrides=dataclasses.replace(drive.overrides, wheel_radius_m=radius_m))
+    told = replay(worn, settings={"labels": true_labels(drive)}).estimate
+    assert told.slip[-50:].mean() == pytest.approx(0.055, abs=0.02)
+    assert told.weights["slip_mean"][-1] > 0.02
 
 
 def test_what_is_remembered_changes_no_bit_of_fixed_weights(drive: Recording) -> None:

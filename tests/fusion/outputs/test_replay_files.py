@@ -64,7 +64,7 @@ def test_metrics_of_a_run_that_broke_are_still_valid(drive, monkeypatch):
         "truth", bad, {"10": bad, "50": None, "100": float("inf")}, bad, bad, bad, None,
         (), ("note",),
     )  # fmt: skip
-    monkeypatch.setattr(replay_files, "terrain_shares", lambda _: {"mud": bad, "snow": 1.0 + 1e-12})
+    monkeypatch.setattr(replay_files, "terrain_shares", lambda *_: {"mud": bad, "snow": 1.0 + 1e-12})
     path = d.estimate.trajectory
     away = dataclasses.replace(path, position_m=np.full(path.position_m.shape, bad))
     estimate = dataclasses.replace(d.estimate, trajectory=away)
@@ -108,6 +108,15 @@ def test_terrain_shares_are_shares_of_time(drive):
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares["asphalt"] == pytest.approx(0.5, abs=0.02)
     assert set(shares) == {"asphalt", "loose_sand"}
+
+
+def test_grounds_that_the_robot_found_take_over_the_share_of_unknown_ground(drive):
+    names = {"asphalt": "unknown", "loose_sand": "loose_sand"}
+    estimate = drive().estimate
+    estimate = dataclasses.replace(estimate, classes=tuple(names.get(c, "mud") for c in estimate.classes))
+    shares = terrain_shares(estimate, {"ground 1": 0.6, "loose_sand": 0.2})
+    expected = {"ground 1": 0.3, "loose_sand": 0.6, "unknown": 0.1}
+    assert shares == pytest.approx(expected, abs=0.02)
 
 
 def test_all_files_are_written_and_read_back(drive, tmp_path):

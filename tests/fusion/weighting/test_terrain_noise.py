@@ -11,6 +11,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import as_vehicle
@@ -66,6 +67,20 @@ def test_a_switch_is_the_share_that_changed_ground_since_it_was_last_asked() -> 
     fixed = noise_of("elevate", mode="fixed")
     fixed.external(0, {name: float(name == "mud") for name in fixed.posterior()})
     assert fixed.take_switch() == 0.0
+
+
+@pytest.mark.parametrize(("label", "renewed"), [("asphalt", False), ("gravel", True), ("", True)])
+def test_a_label_rules_over_changes_among_grounds_that_the_robot_found(label: str, renewed: bool) -> None:
+    """Slips of 0 and 0.4 were found on two grounds; no class describes gravel."""
+    weights = noise_of("husky", labels=GroundLabels((0,), (label,)) if label else None)
+    weights.begin(0)
+    for ground in (1, 2):
+        weights._ground_slip.recognise(np.eye(3)[ground])
+        for _ in range(120):
+            weights._ground_slip.learn(0.4 * (ground - 1), 0.02, 0.0, 0.5)
+    weights.take_switch()
+    weights._ground_slip.recognise(np.eye(3)[1])
+    assert (weights.take_switch() > 0.1) == renewed
 
 
 @pytest.mark.parametrize("robot", ["husky", "elevate"])
