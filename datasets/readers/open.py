@@ -2,11 +2,11 @@
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog, locate
+from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog, locate, sha256_of
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, apply
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -110,6 +110,22 @@ def files_of(path: Path | str) -> list[Path]:
     """
     place, _ = find_log(path)
     return format_of(place).files(place)
+
+
+def hashes_of(logs: Sequence[str]) -> dict[str, str]:
+    """SHA-256 of every file of the logs, by folder and name, with more folders where names coincide.
+
+    Raises:
+        DataError: there is no such log.
+    """
+    files = sorted({file.resolve() for log in logs for file in files_of(log)})
+    longest = max((len(file.parts) for file in files), default=0)
+    names: list[str] = []
+    for parts in range(2, longest + 1):
+        names = ["/".join(file.parts[-parts:]) for file in files]
+        if len(set(names)) == len(files):
+            break
+    return {name: sha256_of(file) for name, file in zip(names, files, strict=True)}
 
 
 def _find_log(path: Path | str) -> tuple[Path, int | None]:

@@ -15,6 +15,7 @@ from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult
 from terrafusion.fusion.replay import replay as run
 from terrafusion.fusion.reports.replay import write_replay
+from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
 
@@ -72,6 +73,7 @@ def replay(
     calibrate: bool = False,
     lag_s: float = 5.0,
     grounds: str | Path | GroundMemory | None = None,
+    terrain_model: str | Path | TerrainModel | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Estimate a recorded drive and score it against its truth, or against fixes that are held out.
@@ -88,6 +90,8 @@ def replay(
         lag_s: length of the smoothing window.
         grounds: what the robot learned of its grounds on earlier drives (a file need not exist yet);
             `result.grounds` holds it with what this drive adds.
+        terrain_model: of this robot, made by `terrafusion terrain train`, or its file; by default the
+            shipped one.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -101,6 +105,8 @@ def replay(
     """
     known = None if vehicle is None else as_vehicle(vehicle)
     (recording,) = opened(log, None if known is None else known.rig())
+    if isinstance(terrain_model, (str, Path)):
+        terrain_model = load_terrain_model(Path(terrain_model))
     result = run(
         recording,
         vehicle=vehicle,
@@ -110,7 +116,7 @@ def replay(
         batch=batch,
         progress=progress,
         magnetometer=magnetometer,
-        settings={"calibrate": calibrate, "lag_s": lag_s},
+        settings={"calibrate": calibrate, "lag_s": lag_s, "terrain_model": terrain_model},
         grounds=read_grounds(Path(grounds)) if isinstance(grounds, (str, Path)) else grounds,
     )
     return Replay(**vars(result))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -40,6 +41,7 @@ def live(
     wait: float = 0.02,
     seconds: float | None = None,
     foxglove: int | None = None,
+    terrain_model: Path | None = None,
 ) -> Result:
     """Run the estimator beside a ROS 2 robot, without ROS: it speaks DDS itself.
 
@@ -66,14 +68,17 @@ def live(
         wait: Seconds that samples wait for others of the same time.
         seconds: Stop after so long; else Ctrl-C.
         foxglove (PORT): Show it in Foxglove at ws://localhost:PORT.
+        terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
     """
     from terrafusion.fusion.live.node import LiveOptions
+    from terrafusion.fusion.terrain.classifier import load_terrain_model
 
     common.check_mode(mode)
     origin = common.parse_point(datum, "LAT,LON,HEIGHT", "--datum")
     options = LiveOptions(
         vehicle, mode, common.parse_topics(topic), common.check_stamps(stamps), frequency=rate, datum=origin,
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
+        terrain_model=None if terrain_model is None else load_terrain_model(terrain_model),
     )  # fmt: skip
     of_a_robot = {
         "--domain": domain is not None, "--loopback": loopback, "--reliable": reliable,
@@ -162,7 +167,9 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
 
     with errors_of(log):
         history = History()
-        estimator = live_estimator(recording, options.vehicle, history, options.mode)
+        estimator = live_estimator(
+            recording, options.vehicle, history, options.mode, False, options.terrain_model
+        )
         taken = run(estimator, recording.messages(), publish, realtime)
         if not newest:
             raise DataError("the estimator never started", remedy="see `terrafusion inspect`")

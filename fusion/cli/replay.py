@@ -60,6 +60,7 @@ def replay(
     magnetometer: bool = False,
     declination: DeclinationOption = None,
     grounds: Path | None = None,
+    terrain_model: Path | None = None,
     *,
     how: common.HowRead,
 ) -> Result:
@@ -85,22 +86,25 @@ def replay(
         magnetometer: Use the log's magnetometer; a barometer is always used.
         grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, and written after the
             drive.
+        terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
     """
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.grounds.file import read_grounds
     from terrafusion.fusion.replay import replay as run
+    from terrafusion.fusion.terrain.classifier import load_terrain_model
 
     _check_usage(mode, rerun)
     turned = None if declination is None else math.radians(declination)
     outages = [_outage(text) for text in gnss_outage or []]
     memory = None if grounds is None else read_grounds(grounds)
+    model = None if terrain_model is None else load_terrain_model(terrain_model)
     recording, findings = _opened(log, vehicle, how, calibrate)
     with common.progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording, vehicle=vehicle, mode=mode, policy=policy, outages=outages, batch=batch,
             magnetometer=magnetometer or declination is not None,
-            settings={"calibrate": calibrate, "declination_rad": turned}, grounds=memory, findings=findings,
-            progress=progress,
+            settings={"calibrate": calibrate, "declination_rad": turned, "terrain_model": model},
+            grounds=memory, findings=findings, progress=progress,
         )  # fmt: skip
     unseen = _write(result, out, mcap, rerun, grounds)
     return _shown(result, findings, unseen, out)

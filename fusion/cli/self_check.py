@@ -11,7 +11,6 @@ from terrafusion.fusion.cli.command import Result
 EXTRAS = {
     "compiler": ("ziglang", "a C compiler for the twin, where the machine has none"),
     "parquet": ("pyarrow", "`terrafusion sweep`"),
-    "learn": ("sklearn", "`terrain train LOGS` and `terrain eval LOGS`"),
     "rerun": ("rerun", "`replay --rerun`, for the Rerun viewer"),
     "cluster": ("distributed", "`--backend dask` of sweep, benchmark, gap-blind and terrain train"),
     "live": ("cyclonedds", "`live` on a robot, over DDS"),

@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,7 @@ from terrafusion.fusion.cli.outputs import Output, parts_of
 from terrafusion.fusion.cli.usage import CommandGroup
 
 if TYPE_CHECKING:
+    from terrafusion.fusion.terrain.classifier import TerrainModel
     from terrafusion.fusion.training.detector_scores import DetectorScores
 
 app = typer.Typer(help="The terrain detector: train its model, score it.", cls=CommandGroup)
@@ -28,6 +29,7 @@ def train(
     logs: Annotated[
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: simulated runs.")
     ] = None,
+    vehicle: common.VehicleOption = None,
     seeds: Annotated[
         int | None, typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False)
     ] = None,
@@ -35,20 +37,22 @@ def train(
     backend: common.BackendOption = "loky",
     address: common.AddressOption = None,
 ) -> Result:
-    """Train the terrain model on simulated runs, or a classifier of one robot's grounds on its labelled logs.
+    """Train the terrain model of a robot on its labelled logs, or the shipped one on simulated runs.
 
-    Without logs the twin drives over soils, slopes, payloads and speeds; one
-    more seed calibrates the probabilities and one scores the model. Stopped,
-    the same command continues.
+    A model of logs goes to `replay --terrain-model`. Without logs the twin
+    drives over soils, slopes, payloads and speeds; one more seed calibrates the
+    probabilities and one scores the model. Stopped, the same command continues.
+
+    Example: terrafusion terrain train --out grounds.yaml monday.bag tuesday.bag --vehicle my_robot.yaml
 
     Example: terrafusion terrain train --out model.yaml
-
-    Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
     common.check_backend(backend, address)
     if logs:
         no_seeds(seeds)
-        return train_on_logs(logs, out)
+        return train_on_logs(logs, vehicle, out)
+    if vehicle is not None:
+        raise TerrafusionError("--vehicle is for logs", remedy="name the logs, or leave it out")
     from terrafusion.fusion.training.train_detector import TrainingPlan, write_model
     from terrafusion.fusion.training.train_detector import train as run
 
@@ -62,16 +66,18 @@ def train(
     return Result(score_lines("held-out seed", scores), done, {"out": str(out), **dataclasses.asdict(scores)})
 
 
-def train_on_logs(logs: list[str], out: Path) -> Result:
-    """Fit, calibrate and write a classifier of labelled logs."""
-    from terrafusion.fusion.training.cross_validation import check_runs, hashes_of, open_runs, train_on
+def train_on_logs(logs: list[str], vehicle: str | None, out: Path) -> Result:
+    """Fit, calibrate and write the model of a robot."""
+    from terrafusion.datasets.readers import hashes_of
+    from terrafusion.fusion.training.logged_runs import open_runs
+    from terrafusion.fusion.training.train_detector import write_model
+    from terrafusion.fusion.training.train_on_logs import train_on
 
-    runs = open_runs(logs)
-    check_runs(runs)
+    runs = open_runs(logs, vehicle)
     made_by = f"terrafusion terrain train --out {out.name}, {len(runs)} runs"
-    model = dataclasses.replace(train_on(runs), inputs=hashes_of(logs), made_by=made_by)
-    model.write(out)
-    windows = sum(len(r.x) for r in runs)
+    model = train_on(runs, hashes_of(logs), made_by)
+    write_model(model, out)
+    windows = sum(len(r.route.windows) for r in runs)
     done = f"{windows} windows of {len(runs)} runs on {', '.join(model.classes)}; written to {out}"
     document = {"out": str(out), "runs": len(runs), "windows": windows, "classes": list(model.classes)}
     return Result((), done, document)
@@ -82,13 +88,13 @@ def evaluate(
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: new simulated runs.")
     ] = None,
     model: Path | None = None,
+    vehicle: common.VehicleOption = None,
     seeds: Annotated[
         int | None, typer.Option(min=1, max=1000, help="New seeds of simulated runs (1).", show_default=False)
     ] = None,
-    test: list[str] | None = None,
     out: Path | None = None,
 ) -> Result:
-    """Score a terrain model on new simulated runs, or a classifier on labelled logs, cross-validated by run.
+    """Score a terrain model on new simulated runs, or on labelled logs, cross-validated by run.
 
     With logs: five folds of whole runs. With logs and a model: its scores on
     these logs, which must not be those of its training.
@@ -97,67 +103,60 @@ def evaluate(
 
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
 
-    Example: terrafusion terrain eval --model grounds.yaml another_day/*/imu_*.csv
+    Example: terrafusion terrain eval --model grounds.yaml wednesday.bag
 
     Args:
-        model: Model file: with logs of `train LOGS`, else of the detector (default: the shipped one).
-        test: Labelled logs of another robot (may be given again).
+        model: Model file (default without logs: the shipped one).
         out: JSON file for the scores of the logs.
     """
     if logs:
         no_seeds(seeds)
-        if model is None:
-            return evaluate_logs(logs, test or [], out)
-        if test:
-            raise TerrafusionError("--test needs a model trained by this command", remedy="leave out --model")
-        return evaluate_model(model, logs, out)
-    if test or out is not None:
-        raise TerrafusionError("--test and --out need labelled logs", remedy="name the logs to train on")
+        return evaluate_logs(logs, vehicle, model, out)
+    if vehicle is not None or out is not None:
+        raise TerrafusionError("--vehicle and --out need labelled logs", remedy="name the logs")
     from terrafusion.fusion.terrain.classifier import load_terrain_model
-    from terrafusion.fusion.training import detector_trials as trials
+    from terrafusion.fusion.training.detector_scores import evaluate as scores_of
+    from terrafusion.fusion.training.train_detector import TrainingPlan, fresh_routes
 
-    loaded = load_terrain_model(model)
-    with progress("runs", trials.count(seeds or 1)) as tick:
-        results = trials.run(loaded, seeds or 1, tick)
-    lines = [line for name, scores in results.items() for line in [*score_lines(name, scores), ""]]
-    return Result(lines, "", {name: dataclasses.asdict(scores) for name, scores in results.items()})
-
-
-def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> Result:
-    """Cross-validate labelled logs; write the scores where asked for."""
-    from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
-    from terrafusion.fusion.training.surface_report import lines_of, report_on
-
-    report = report_on(open_runs(logs), open_runs(test) if test else [])
-    return scored(report | {"inputs": hashes_of([*logs, *test])}, lines_of(report), out)
+    loaded, count = load_terrain_model(model), seeds or 1
+    with progress("runs", count * len(TrainingPlan().grid(0).conditions())) as tick:
+        scores = scores_of(loaded, fresh_routes(count, tick))
+    return Result(score_lines("new runs", scores), "", dataclasses.asdict(scores))
 
 
-def evaluate_model(model: Path, logs: list[str], out: Path | None) -> Result:
-    """Score a model on labelled logs that it was not trained on; write the scores where asked for."""
-    from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
-    from terrafusion.fusion.training.softmax import read_softmax
-    from terrafusion.fusion.training.surface_report import figures_lines, score
-
-    classifier, inputs = read_softmax(model), hashes_of(logs)
-    known = sorted(name for name, sha256 in inputs.items() if sha256 in classifier.inputs.values())
-    if known:
-        raise TerrafusionError(
-            f"was trained on {len(known)} of these files, such as {known[0]}",
-            file=model,
-            remedy="give other logs; without --model they are left out in turn",
-        )
-    report = score(classifier, open_runs(logs))
-    return scored(report | {"inputs": inputs}, figures_lines(report), out)
-
-
-def scored(report: dict[str, Any], lines: list[str], out: Path | None) -> Result:
-    """Scores as the result of the command, also written as JSON if `out` is given."""
+def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out: Path | None) -> Result:
+    """Score models of the other folds, or the given one, on labelled logs; write the scores."""
     from terrafusion.datasets.core.json_text import finite, to_json
+    from terrafusion.datasets.readers import hashes_of
     from terrafusion.fusion.reports.page import write_text
+    from terrafusion.fusion.training.logged_runs import open_runs
+    from terrafusion.fusion.training.train_on_logs import cross_validated, scores_on
 
+    loaded = None if model is None else untrained_on(model, logs)
+    runs = open_runs(logs, vehicle)
+    scores = cross_validated(runs) if loaded is None else scores_on(loaded, runs)
+    report = {**dataclasses.asdict(scores), "inputs": hashes_of(logs)}
     if out is not None:
         write_text(out, to_json(report, indent=1) + "\n")
-    return Result(lines, "" if out is None else f"written to {out}", finite(report))
+    done = "" if out is None else f"written to {out}"
+    return Result(score_lines(f"{len(runs)} runs", scores), done, finite(report))
+
+
+def untrained_on(path: Path, logs: list[str]) -> TerrainModel:
+    """A model that was trained on none of the logs; one is known where all of its files are."""
+    from terrafusion.datasets.readers import hashes_of
+    from terrafusion.fusion.terrain.classifier import load_terrain_model
+
+    model = load_terrain_model(path)
+    trained = set(model.inputs.values())
+    known = [log for log in logs if set(hashes_of([log]).values()) <= trained]
+    if known:
+        raise TerrafusionError(
+            f"was trained on {len(known)} of these logs, such as {known[0]}",
+            file=path,
+            remedy="give other logs; without --model they are left out in turn",
+        )
+    return model
 
 
 def no_seeds(seeds: int | None) -> None:

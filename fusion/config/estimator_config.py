@@ -12,6 +12,7 @@ from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import Policy, load_policy
+from terrafusion.fusion.terrain.classifier import TerrainModel
 
 
 class EstimatorOptions(TypedDict, total=False):
@@ -31,6 +32,7 @@ class EstimatorOptions(TypedDict, total=False):
     self_calibrate: bool
     declination_rad: float | None
     labels: GroundLabels | None
+    terrain_model: TerrainModel | None
 
 
 _RANGES = {
@@ -74,6 +76,8 @@ class EstimatorConfig:
         declination_rad: magnetic north, east of true north; with it a magnetometer measures the
             heading, without it it holds that of GNSS or the start.
         labels: the ground over time, in place of the detector; None: it detects.
+        terrain_model: of the detector, trained on this robot (`terrafusion terrain train`); None: the shipped
+            one. Its grounds that the policy does not know have the pooled noise, and the slip of the drive.
         grounds: what the robot learned of its grounds on earlier drives; with it grounds are recognised by
             `grounds.memory` and learned.
     """
@@ -98,6 +102,7 @@ class EstimatorConfig:
     declination_rad: float | None = None
     labels: GroundLabels | None = None
     grounds: GroundMemory | None = None
+    terrain_model: TerrainModel | None = None
 
     @property
     def longest_wait_s(self) -> float:
@@ -108,6 +113,14 @@ class EstimatorConfig:
         if not isinstance(self.rig, Rig):
             remedy = "give Vehicle.load(NAME).rig(), or use Estimator.for_vehicle(NAME)"
             raise ConfigError(f"a {type(self.rig).__name__} is no rig", remedy=remedy)
+        if self.terrain_model is not None:
+            model = self.terrain_model
+            if self.vehicle not in model.vehicles:
+                raise ConfigError(
+                    f"the terrain model is of {', '.join(model.vehicles)}, the vehicle is {self.vehicle}",
+                    remedy="train one on its own logs with `terrafusion terrain train`",
+                )
+            object.__setattr__(self, "policy", self.policy.with_grounds(model.classes))
         for what, value, known in (
             ("mode", self.mode, MODES),
             ("robust_loss", self.robust_loss, ROBUST_LOSSES),

@@ -21,6 +21,7 @@ from terrafusion.fusion.metrics.baselines import baselines
 from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import score
 from terrafusion.fusion.metrics.verdict import Verdict, judge
+from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.twin.model.choose import choose_vehicle
 
 
@@ -47,6 +48,7 @@ def live_estimator(
     history: History | None = None,
     mode: str = "adaptive",
     gnss: bool = False,
+    terrain_model: TerrainModel | None = None,
 ) -> Estimator:
     """An estimator for the robot and the sensors of a recording.
 
@@ -56,6 +58,7 @@ def live_estimator(
         history: collects the states.
         mode: as in `EstimatorConfig`.
         gnss: fixes will come, though the recording has none.
+        terrain_model: as in `EstimatorConfig`.
 
     Raises:
         DataError: the log has no IMU or no wheels, or nothing tells the robot's geometry.
@@ -68,7 +71,7 @@ def live_estimator(
     robot, _ = choose_vehicle(recording, vehicle)
     inputs = sensor_config_of(recording, recording.gnss)
     inputs = dataclasses.replace(inputs, gnss=inputs.gnss or gnss)
-    config = EstimatorConfig(robot.rig(), robot.name, mode, inputs=inputs)
+    config = EstimatorConfig(robot.rig(), robot.name, mode, inputs=inputs, terrain_model=terrain_model)
     if history is None:
         return Estimator(config)
     estimator = Estimator(

@@ -49,6 +49,7 @@ from terrafusion.fusion.live.loop import live_estimator
 from terrafusion.fusion.live.ordered import OrderedSamples
 from terrafusion.fusion.live.published import Frames
 from terrafusion.fusion.live.sensors import Sensors, find_sensors
+from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.twin.model.vehicle import load_vehicle
 
 CLOCK = ("/clock", "rosgraph_msgs/msg/Clock")
@@ -71,7 +72,7 @@ class LiveOptions:
 
     Attributes:
         vehicle: name or YAML file.
-        mode: as in `EstimatorConfig`.
+        mode, terrain_model: as in `EstimatorConfig`.
         topics: topic by channel, as `--topic`; the others are found by type and name.
         stamps: "header", or "receipt" for a robot whose clocks do not agree.
         frames: names of the frames.
@@ -94,6 +95,7 @@ class LiveOptions:
     wait_s: float = 0.02
     use_sim_time: bool = False
     prefix: str = ""
+    terrain_model: TerrainModel | None = None
 
     def __post_init__(self) -> None:
         if not self.frequency > 0.0:
@@ -268,7 +270,12 @@ class LiveNode:
     def _new_estimator(self, sensors: Sensors) -> Estimator:
         options = self.options
         return live_estimator(
-            sensors.recording, options.vehicle, self._history, options.mode, gnss=sensors.gnss
+            sensors.recording,
+            options.vehicle,
+            self._history,
+            options.mode,
+            sensors.gnss,
+            options.terrain_model,
         )
 
     def _pass_on(self, arriving: ArrivingMessages, message: RawMessage) -> None:

@@ -7,6 +7,7 @@ spread of the class means (law of total variance).
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -93,6 +94,10 @@ class Policy:
     def names(self) -> tuple[str, ...]:
         """Class names in the file's order; probabilities are given in this order."""
         return tuple(self.classes)
+
+    def with_grounds(self, names: Iterable[str]) -> "Policy":
+        """With the pooled noise on the named grounds that it does not know."""
+        return dataclasses.replace(self, classes={**dict.fromkeys(names, self.fixed), **self.classes})
 
     @functools.cached_property
     def _table(self) -> NDArray[np.float64]:

@@ -64,6 +64,7 @@ class TerrainModel:
         vehicles: names of the vehicles whose vibration the model knows.
         slip_only: use the slip alone; see `for_vehicle`.
         scores: held-out figures of the training.
+        inputs: name -> SHA-256 of the files of logs that it was trained on.
     """
 
     classes: dict[str, Mixture]
@@ -75,6 +76,7 @@ class TerrainModel:
     made_by: str = ""
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
     slip_only: bool = False
+    inputs: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def for_vehicle(self, name: str | None) -> Self:
         """The model for a robot.
@@ -183,6 +185,7 @@ class TerrainModelFile:
     classes: dict[str, tuple[ComponentFile, ...]]
     unknown: tuple[ComponentFile, ...]
     scores: dict[str, Any]
+    inputs: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
 @functools.cache
@@ -210,6 +213,7 @@ def load_terrain_model(path: Path | None = None) -> TerrainModel:
         inputs_sha256=content.inputs_sha256,
         made_by=content.made_by,
         scores=content.scores,
+        inputs=content.inputs,
     )
 
 

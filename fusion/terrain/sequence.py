@@ -32,10 +32,6 @@ class PatchFilter:
             self._set(self.probabilities * (1.0 - drawn) + self.prior * drawn)
         return self.probabilities
 
-    def forget(self, share: float) -> None:
-        """Return to the prior by a share (0 to 1)."""
-        self._set(self.probabilities * (1.0 - share) + self.prior * share)
-
     def update(self, log_likelihood: ArrayLike) -> Array:
         """Weight the classes by log-evidence (k,), known up to a constant; NaN or +inf count as none."""
         evidence = np.asarray(log_likelihood, dtype=float)

@@ -89,12 +89,20 @@ def changes_in(windows: list[Window], labels: NDArray[Any]) -> LabelledRoute:
 
 def evaluate(model: TerrainModel, routes: Sequence[LabelledRoute]) -> DetectorScores:
     """Run a new detector along each route and score it."""
-    classes = (*model.classes, UNKNOWN)
+    return evaluate_each([(model, route) for route in routes])
+
+
+def evaluate_each(trials: Sequence[tuple[TerrainModel, LabelledRoute]]) -> DetectorScores:
+    """Run a new detector along each route, by the model beside it, and score them all.
+
+    The models have the same classes.
+    """
+    classes = (*trials[0][0].classes, UNKNOWN)
     winners, confidences, truths = [], [], []
     delays: list[float] = []
     missed = false = 0
     seconds = updates = 0.0
-    for route in routes:
+    for model, route in trials:
         detector = TerrainDetector(model, classes)
         begin = time.process_time()
         p = np.array([detector.update(window) for window in route.windows])

@@ -75,7 +75,8 @@ def shrink(covariance: Array, samples: float) -> Array:
 
 
 def _start(x: Array, parts: int, order_by: int) -> tuple[Array, Array, Array]:
-    middle = np.nan_to_num(np.nanmedian(x, axis=0))
+    seen, middle = np.isfinite(x).any(axis=0), np.zeros(x.shape[1])
+    middle[seen] = np.nanmedian(x[:, seen], axis=0)
     key = np.where(np.isfinite(x[:, order_by]), x[:, order_by], middle[order_by])
     groups = np.array_split(np.argsort(key, kind="stable"), parts)
     filled = np.where(np.isfinite(x), x, middle)

@@ -65,8 +65,7 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
         DataError: a log lacks wheels, truth or labels, or moves too little on a ground.
         TerrafusionError: a log cannot be read.
     """
-    from terrafusion.datasets.readers import open_recordings
-    from terrafusion.fusion.training.cross_validation import hashes_of
+    from terrafusion.datasets.readers import hashes_of, open_recordings
 
     parts: dict[str, list[GroundSamples]] = {}
     for log in logs:

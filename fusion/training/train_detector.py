@@ -33,6 +33,8 @@ PAYLOADS_KG = (0.0, 30.0)
 CALIBRATION_SEED, SCORING_SEED, FRESH_SEED = 1000, 2000, 3000
 PATCH_LENGTH_M = 25.0
 SIGMA_FLOOR = np.array([0.03] * SLIP + [0.02, 0.05])
+NEVER_SEEN = 1.0
+"""1 sigma of a feature that no ground shows, so that it says nothing."""
 UNKNOWN_SPREAD = 3.0
 """Standard deviations of `unknown` over those of all grounds pooled."""
 UNKNOWN_SHARE = 0.03
@@ -94,35 +96,47 @@ def train(
     rows: dict[str, list[Array]] = {ground: [] for ground in GROUNDS}
     for windows, ground in training:
         rows[ground].append(features_of(windows))
-    mixtures = {}
-    for ground, features in rows.items():
-        x = np.vstack(features)
-        try:
-            fitted = fit_best(x, SIGMA_FLOOR, SLIP)
-        except ValueError as error:
-            raise TerrafusionError(
-                str(error), channel=ground, remedy="train with more seeds, scenarios or slopes"
-            ) from None
-        mixtures[ground] = fitted
-    draft = TerrainModel(
-        classes=mixtures,
-        unknown=_broad(mixtures),
-        temperature=1.0,
-        patch_length_m=PATCH_LENGTH_M,
-        vehicles=(plan.training().vehicle,),
+    fitted = dataclasses.replace(
+        draft({ground: np.vstack(features) for ground, features in rows.items()}, plan.training().vehicle),
         inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
     )
-    model = calibrate(draft, splice(calibration, PATCHES, CALIBRATION_SEED))
+    model = calibrate(fitted, splice(calibration, PATCHES, CALIBRATION_SEED))
     scores = evaluate(model, [splice(scoring, PATCHES, SCORING_SEED)])
     if store is not None:
         store.clear()
     return dataclasses.replace(model, scores=_plain(scores)), scores
 
 
+def draft(rows: dict[str, Array], vehicle: str) -> TerrainModel:
+    """Densities of the features (n, 7) of each ground, not yet calibrated. A feature that no ground shows
+    has the same wide density on all of them.
+
+    Raises:
+        TerrafusionError: too few windows on a ground.
+    """
+    seen = np.any([np.isfinite(x).any(axis=0) for x in rows.values()], axis=0)
+    floor = np.where(seen, SIGMA_FLOOR, NEVER_SEEN)
+    mixtures = {}
+    for ground, x in rows.items():
+        try:
+            mixtures[ground] = fit_best(x, floor, SLIP)
+        except ValueError as error:
+            raise TerrafusionError(
+                str(error), channel=ground, remedy="train with more drives on that ground"
+            ) from None
+    return TerrainModel(mixtures, _broad(mixtures), 1.0, PATCH_LENGTH_M, (vehicle,))
+
+
 def windows_by_run(grid: Grid, tick: Callable[[], None]) -> list[LabelledWindows]:
     """The windows and ground of every run of a grid."""
     return run_windows(grid.conditions(), Workers(None), None, tick)
+
+
+def fresh_routes(seeds: int, tick: Callable[[], None] = lambda: None) -> list[LabelledRoute]:
+    """Routes spliced from simulated runs of new seeds."""
+    grids = {seed: TrainingPlan().grid(seed) for seed in range(FRESH_SEED, FRESH_SEED + seeds)}
+    return [splice(windows_by_run(grid, tick), PATCHES, seed) for seed, grid in grids.items()]
 
 
 def run_windows(
@@ -248,6 +262,7 @@ def write_model(model: TerrainModel, path: Path) -> None:
         "classes": {name: _listed(mixture) for name, mixture in model.classes.items()},
         "unknown": _listed(model.unknown),
         "scores": model.scores,
+        **({"inputs": model.inputs} if model.inputs else {}),
     }
     dump_yaml(path, content, default_flow_style=None, width=110)
 

@@ -53,12 +53,13 @@ class TerrainNoise:
         noise: the noise in force.
         per_measurement: what the mode makes of single measurements.
         changes: what changed since `take_changes` was last called, the newest `MOST_CHANGES` of it.
+        window: the newest window that the detector was given.
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.policy = config.tuning.adaptive.applied_to_policy(config.policy)
         self.adaptive = config.mode == "adaptive"
-        model = load_terrain_model().for_vehicle(config.vehicle)
+        model = (config.terrain_model or load_terrain_model()).for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._label_probabilities: Array | None = None
@@ -85,6 +86,7 @@ class TerrainNoise:
         self._next_ns = self._updated_ns = 0
         self._grade = 0.0
         self._on_found_s: dict[str, float] = {}
+        self.window: Window | None = None
         self._last_speed = np.nan
         self._source = "detector"
 
@@ -190,7 +192,7 @@ class TerrainNoise:
             return
         before_ns, self._updated_ns = self._updated_ns, state.t_ns
         self._next_ns = state.t_ns + UPDATE_NS
-        window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
+        self.window = window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
         ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
         self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])

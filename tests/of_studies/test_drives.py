@@ -18,11 +18,11 @@ from terrafusion.fusion.benchmark.twin_runs import (
     soils_of,
 )
 from terrafusion.fusion.terrain.external import TRUE_SOURCES
-from terrafusion.fusion.training import detector_trials as trials
 from terrafusion.fusion.training import train_detector as train
 from terrafusion.fusion.training.policy_fit import default_grid
 from terrafusion.fusion.training.simulated_runs import SOIL_SCATTER
 from terrafusion.twin.model.soil import load_soil
+from tests.studies import detector_trials as trials
 from tests.studies import twin_consistency
 from tests.studies.mode_tuning import DRIVES, MIXED
 

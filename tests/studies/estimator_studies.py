@@ -184,28 +184,15 @@ ESTIMATOR = (
         spread=True,
     ),
     Study(
-        "ground_changes",
-        "How soon is a change of ground noticed, and named, by a classifier of the robot's own grounds?",
-        module("ground_changes"),
-        3,
-        {
-            "macro_f1": r"macro-F1 ([\d.]+)",
-            "ece": r"macro-F1 [\d.]+, ECE ([\d.]+)",
-            "alarm_within_2_s": r"alarm within 2 s: (\d+ ?%)",
-            "false_alarms": r"false alarms a minute: ([\d.]+)",
-            "named_within_2_s": r"new ground named within 2 s: (\d+ ?%)",
-            "named_after_s": r"new ground named after, median: ([\d.]+)",
-        },
-    ),
-    Study(
-        "ground_features",
-        "What carries the classification of a robot's own grounds, and is a ground never seen called new?",
-        module("ground_classifier.experiments"),
+        "own_grounds",
+        "How well does a terrain model that is trained on a robot's own labelled logs know its grounds?",
+        module("own_grounds"),
         4,
         {
-            "all_features": r"nothing +([\d.]+)",
-            "forest_by_run": r"extra trees, .* by run ([\d.]+)",
-            "forest_leaking": r"windows of one run .*extra trees ([\d.]+)",
+            "runs": r"(\d+) runs:",
+            "macro_f1": r"macro-F1 ([\d.]+)",
+            "ece": r"ECE ([\d.]+)",
+            "unknown": r"unknown ([\d.]+)$",
         },
     ),
     Study(
@@ -268,7 +255,7 @@ ESTIMATOR = (
     Study(
         "detector",
         "How well are grounds told apart, on fresh drives, with sensors missing, on grounds never seen?",
-        ("terrafusion", "terrain", "eval"),
+        module("detector_trials"),
         20,
     ),
 )

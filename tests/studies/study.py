@@ -40,7 +40,7 @@ class Study:
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
     "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix",
-    "coarse_slides", "course_lag", "ground_changes", "ground_features",
+    "coarse_slides", "course_lag", "own_grounds",
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers import files_of, open_recording
+from terrafusion.datasets.readers import files_of, hashes_of, open_recording
 from terrafusion.datasets.readers.sets import borealtc_csv
 from tests.differences import differences
 
@@ -331,3 +331,22 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
         file.truncate(600 << 20)  # sparse: takes no room on the disk
     with pytest.raises(DataError, match="more than 512 MB"):
         open_recording(tmp_path / "imu_00.csv")
+
+
+def test_what_was_read_is_every_file_of_the_logs(tmp_path: Path) -> None:
+    folders = [tmp_path / day / "ICE" for day in ("one", "two")]
+    for i, folder in enumerate(folders):
+        folder.mkdir(parents=True)
+        for kind, head in (("imu", "time,wx,wy,wz,ax,ay,az"), ("pro", "time,curL,curR,velL,velR")):
+            (folder / f"{kind}_01.csv").write_text(
+                f"{head}\n" + ",".join([str(i)] * (head.count(",") + 1)) + "\n"
+            )
+        (folder / "imu_02.csv").write_text("of another run")
+    hashes = hashes_of([str(folder / "imu_01.csv") for folder in folders])
+    assert list(hashes) == [f"{day}/ICE/{kind}_01.csv" for day in ("one", "two") for kind in ("imu", "pro")]
+    assert len(set(hashes.values())) == 4
+    one = hashes_of([str(folders[0] / "pro_01.csv")])
+    assert list(one) == ["ICE/imu_01.csv", "ICE/pro_01.csv"]
+    assert set(one.values()) < set(hashes.values())
+    with pytest.raises(DataError, match="no such file"):
+        hashes_of(["absent.csv"])

@@ -1,31 +1,29 @@
-"""Tests of the terrain detector for `terrafusion terrain eval`: new runs, missing sensors, unseen grounds."""
+"""How well are grounds told apart, on fresh drives, with sensors missing, on grounds never seen?
+
+python -m tests.studies.detector_trials
+"""
 
 import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
-from terrafusion.fusion.terrain.classifier import TerrainModel
+from terrafusion.fusion.cli.terrain import score_lines
+from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.training.detector_scores import (
     DetectorScores,
     LabelledRoute,
     changes_in,
     evaluate,
-    splice,
 )
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, windows_of
-from terrafusion.fusion.training.train_detector import FRESH_SEED, PATCHES, TrainingPlan, windows_by_run
+from terrafusion.fusion.training.train_detector import FRESH_SEED, fresh_routes
 from terrafusion.twin.simulate import simulate
 
 MIXED_RUNS = 4
 SLOW_HZ = 30.0
 """Rate of the slowest IMU among the field logs."""
-
-
-def count(seeds: int) -> int:
-    """Number of runs that `run` simulates."""
-    return seeds * len(TrainingPlan().grid(0).conditions()) + seeds * MIXED_RUNS
 
 
 def run(
@@ -40,8 +38,7 @@ def run(
     - mixed route: simulated runs over several grounds;
     - without X: ground X left out of the model and expected to be unknown.
     """
-    fresh = range(FRESH_SEED, FRESH_SEED + seeds)
-    routes = [splice(list(windows_by_run(TrainingPlan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
+    routes = fresh_routes(seeds, tick)
     mixed = [_mixed(MIXED_RUNS * FRESH_SEED + number, tick) for number in range(MIXED_RUNS * seeds)]
     foreign = model.for_vehicle(None)
     firm = sorted(set(model.classes) - set(foreign.classes))
@@ -101,3 +98,14 @@ def _slow(window: Window) -> Window:
         gyro_radps=np.add.reduceat(window.gyro_radps, cuts) / sizes,
         accel_mps2=np.add.reduceat(window.accel_mps2, cuts) / sizes,
     )
+
+
+def main() -> int:
+    """Print the scores of the shipped model."""
+    for name, scores in run(load_terrain_model(), 1).items():
+        print("\n".join([*score_lines(name, scores), ""]))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,119 @@
+"""Training of the terrain model on labelled logs of one robot, and its cross-validation by run.
+
+Temperature and weight of `unknown` are calibrated on runs that the densities were not fitted to, spliced to
+routes over several grounds.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.fusion.terrain.classifier import TerrainModel
+from terrafusion.fusion.terrain.features import Window
+from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate_each, splice
+from terrafusion.fusion.training.logged_runs import LoggedRun
+from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
+
+FOLDS = 5
+MIN_RUNS = 2
+"""Of a ground: one to fit to, one to calibrate or to test on."""
+
+
+def train_on(runs: Sequence[LoggedRun], inputs: dict[str, str], made_by: str = "") -> TerrainModel:
+    """A model of the robot of `runs`.
+
+    Args:
+        inputs: name -> SHA-256 of the files of the logs.
+
+    Raises:
+        DataError: fewer than two grounds, a ground with a single run, or too little of one.
+    """
+    check_runs(runs)
+    half = assign_folds(runs, 2)
+    part = _fitted([run for run, fold in zip(runs, half, strict=True) if fold == 0])
+    held_out = [run for run, fold in zip(runs, half, strict=True) if fold == 1]
+    calibrated = calibrate(part, splice([piece for run in held_out for piece in pieces(run)], PATCHES, 0))
+    model = _fitted(runs)
+    unknown = dataclasses.replace(model.unknown, log_weight=calibrated.unknown.log_weight)
+    return dataclasses.replace(
+        model, unknown=unknown, temperature=calibrated.temperature, inputs=inputs, made_by=made_by
+    )
+
+
+def cross_validated(runs: Sequence[LoggedRun]) -> DetectorScores:
+    """Scores of every run by a model of the other folds.
+
+    Raises:
+        DataError: as `train_on`, also where a fold leaves a ground with a single run.
+    """
+    check_runs(runs)
+    fold_of = assign_folds(runs, FOLDS)
+    tried: list[tuple[TerrainModel, LabelledRoute]] = []
+    for fold in sorted(set(fold_of)):
+        model = train_on([run for run, f in zip(runs, fold_of, strict=True) if f != fold], {})
+        tried += [(model, run.route) for run, f in zip(runs, fold_of, strict=True) if f == fold]
+    return evaluate_each(tried)
+
+
+def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:
+    """Scores of a model on runs that it was not trained on.
+
+    Raises:
+        DataError: a ground without a class in the model, or another vehicle.
+    """
+    strange = sorted(set().union(*(run.grounds() for run in runs)) - set(model.classes))
+    if strange:
+        raise DataError(
+            f"the model does not know {', '.join(strange)}",
+            channel="terrain",
+            remedy=f"give runs on {', '.join(model.classes)}",
+        )
+    return evaluate_each([(model, run.route) for run in runs])
+
+
+def check_runs(runs: Sequence[LoggedRun]) -> None:
+    """Check that there are several grounds, each with runs to leave one out.
+
+    Raises:
+        DataError: there are not.
+    """
+    counts = Counter(ground for run in runs for ground in run.grounds())
+    if len(counts) < 2:
+        raise DataError("training needs at least two grounds", channel="terrain", remedy="give more logs")
+    for ground, count in sorted(counts.items()):
+        if count < MIN_RUNS:
+            raise DataError(
+                f"ground '{ground}' has {count} run, {MIN_RUNS} are needed to leave one out",
+                channel="terrain",
+                remedy="give more runs of it, or none",
+            )
+
+
+def assign_folds(runs: Sequence[LoggedRun], folds: int) -> list[int]:
+    """The fold of each run: the runs of a ground, longest first, are dealt out in turn."""
+    order = sorted(range(len(runs)), key=lambda i: (min(runs[i].grounds()), -len(runs[i].route.windows)))
+    fold_of = [0] * len(runs)
+    for place, i in enumerate(order):
+        fold_of[i] = place % folds
+    return fold_of
+
+
+def pieces(run: LoggedRun) -> list[tuple[list[Window], str]]:
+    """The windows of each stretch of a run on one ground."""
+    route, ends = run.route, [*run.route.starts[1:], len(run.route.windows)]
+    return [
+        (route.windows[a:b], str(route.labels[a])) for a, b in zip(route.starts, ends, strict=True) if b > a
+    ]
+
+
+def _fitted(runs: Sequence[LoggedRun]) -> TerrainModel:
+    rows: dict[str, list[Array]] = {}
+    for windows, ground in (piece for run in runs for piece in pieces(run)):
+        rows.setdefault(ground, []).append(features_of(windows))
+    x = {ground: np.vstack(parts) for ground, parts in sorted(rows.items())}
+    everywhere = np.all([np.isfinite(one).any(axis=0) for one in x.values()], axis=0)
+    return draft({ground: np.where(everywhere, one, np.nan) for ground, one in x.items()}, runs[0].vehicle)
