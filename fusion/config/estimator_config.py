@@ -75,7 +75,8 @@ class EstimatorConfig:
             (`calibration.online`); not together with `calibrate`.
         declination_rad: magnetic north, east of true north; with it a magnetometer measures the
             heading, without it it holds that of GNSS or the start.
-        labels: the ground over time, in place of the detector; None: it detects.
+        labels: the ground over time, in place of the detector as far as wheels and IMU do not contradict
+            it; None: it detects.
         terrain_model: of the detector, trained on this robot (`terrafusion terrain train`); None: the shipped
             one. Its grounds that the policy does not know have the pooled noise, and the slip of the drive.
         grounds: what the robot learned of its grounds on earlier drives; with it grounds are recognised by

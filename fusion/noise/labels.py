@@ -1,4 +1,4 @@
-"""Ground labels for the estimator, in place of its terrain detector."""
+"""Ground labels for the estimator, in place of its terrain detector while nothing contradicts them."""
 
 import bisect
 from dataclasses import dataclass

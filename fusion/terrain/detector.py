@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
+from terrafusion.fusion.terrain.credit import SourceCredit
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter
 
@@ -26,6 +27,9 @@ class TerrainDetector:
         classes: the classes, `unknown` among them, in the order of all probabilities given and
             returned (`Policy.names()`).
 
+    Attributes:
+        credit: of an external source.
+
     Raises:
         ConfigError: `classes` has no `unknown`, or a name twice.
     """
@@ -39,6 +43,7 @@ class TerrainDetector:
         self.classes = classes
         self._table, self._by_vibration = LikelihoodTable(model, classes), not model.slip_only
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
+        self.credit = SourceCredit(self._filter.prior, classes.index(UNKNOWN))
 
     @property
     def probabilities(self) -> Array:
@@ -50,14 +55,16 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            self._filter.update(self._table.evaluate(*extract(window, self._by_vibration)))
+            evidence = self._table.evaluate(*extract(window, self._by_vibration))
+            self.credit.check(evidence)
+            self._filter.update(evidence)
         return self.probabilities
 
     def fuse(self, probabilities: ArrayLike) -> Array:
         """Class probabilities (k,) after an external source (a camera) gave its own (k,).
 
-        They multiply in as evidence relative to equal probabilities, tempered by `EXTERNAL_TRUST`, after a
-        share `EXTERNAL_ERROR` of them is spread evenly.
+        They multiply in as evidence relative to equal probabilities, tempered by `EXTERNAL_TRUST` and the
+        source's `credit`, after a share `EXTERNAL_ERROR` of them is spread evenly.
 
         Raises:
             DataError: not k finite, non-negative numbers with a positive sum.
@@ -70,6 +77,7 @@ class TerrainDetector:
                 channel="terrain",
                 remedy=f"give one for each of {', '.join(self.classes)}",
             )
+        self.credit.claim(q / q.sum())
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
-        self._filter.update(EXTERNAL_TRUST * np.log(q))
+        self._filter.update(EXTERNAL_TRUST * self.credit.value * np.log(q))
         return self.probabilities

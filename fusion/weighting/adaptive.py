@@ -62,6 +62,7 @@ class TerrainNoise:
         model = (config.terrain_model or load_terrain_model()).for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
+        self._claimed: Array | None = None
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
         self._starts_pooled = model.slip_only
@@ -151,7 +152,7 @@ class TerrainNoise:
         """Start the clock; the first noise is a change from the policy's fixed one."""
         self._next_ns, self._updated_ns = t_ns + WINDOW_NS, t_ns
         self._recorded = self.policy.fixed
-        self._apply_labels(t_ns)
+        self._take_label(t_ns)
         self._reweight(t_ns)
 
     def posterior(self) -> dict[str, float]:
@@ -194,6 +195,7 @@ class TerrainNoise:
         self._next_ns = state.t_ns + UPDATE_NS
         self.window = window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
+        self._weigh_label()
         ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
         self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])
         if self.grounds is not None:
@@ -206,7 +208,7 @@ class TerrainNoise:
                 self._on_found_s[name] = self._on_found_s.get(name, 0.0) + window.dt_s
         self._learn_driven_slip(window)
         self._source = "detector"
-        self._apply_labels(state.t_ns)
+        self._take_label(state.t_ns)
         self._reweight(state.t_ns)
 
     def _on_the_level(self, window: Window) -> Window:
@@ -226,11 +228,19 @@ class TerrainNoise:
         self._driven.add(self._shares, window.slip, window.slip_sigma, self._grade, window.dt_s)
         self._slips = self._driven.posterior()
 
-    def _apply_labels(self, t_ns: int) -> None:
-        """Take the ground from the labels, where there are some; the detector runs on, unused."""
+    def _take_label(self, t_ns: int) -> None:
+        """Take the ground from the labels, where there are some."""
         if self._labels is not None:
-            self._label_probabilities = self._labels.probabilities(t_ns, self.detector.classes)
+            self._claimed = self._labels.probabilities(t_ns, self.detector.classes)
+            self.detector.credit.claim(self._claimed)
             self._source = "label"
+            self._weigh_label()
+
+    def _weigh_label(self) -> None:
+        """Believe the label as far as it has credit, beyond that the detector."""
+        if self._claimed is not None:
+            doubt = 1.0 - self.detector.credit.value
+            self._label_probabilities = self._claimed + doubt * (self.detector.probabilities - self._claimed)
 
     def _window(self, state: State, imu: ImuStream, wheels: WheelStream, dt_s: float) -> Window:
         """The last second up to `state`, `dt_s` after the last update: slow wheels make rare keyframes."""

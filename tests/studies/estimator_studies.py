@@ -191,9 +191,17 @@ ESTIMATOR = (
         {
             "runs": r"(\d+) runs:",
             "macro_f1": r"macro-F1 ([\d.]+)",
-            "ece": r"ECE ([\d.]+)",
-            "unknown": r"unknown ([\d.]+)$",
+            "ece": r"macro-F1 .*; ECE ([\d.]+)",
+            "unknown": r"macro-F1 .*; unknown ([\d.]+)",
         },
+    ),
+    Study(
+        "wrong_labels",
+        "What do right and wrong labels of the ground cost, where wheels and IMU check them?",
+        module("wrong_labels", "--out", OUT),
+        6,
+        {name: rf"all, {name} labels over fixed: (.*)" for name in ("true", "shuffled", "adversarial")},
+        spread=True,
     ),
     Study(
         "slip_model",

@@ -7,11 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+import terrafusion as tf
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.replay import replay
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import as_vehicle
@@ -186,3 +189,21 @@ def test_grounds_are_learned_where_no_model_knows_them_or_a_memory_is_given() ->
     ):
         assert memory is not None
         assert len(memory) == 0
+
+
+@pytest.mark.parametrize(("label", "believed"), [("asphalt", True), ("mud", False)])
+def test_a_label_that_wheels_and_imu_contradict_is_not_believed(label: str, believed: bool) -> None:
+    """The terrain model knows the robot; a wrong label must not teach the slip of its ground either."""
+    drive = until(tf.simulate("figure_eight", terrain="asphalt", seed=3), 20.0)
+    seen = list[TerrainNoise]()
+    told = replay(
+        drive,
+        settings={"labels": GroundLabels((drive.start_ns,), (label,))},
+        findings=(),
+        watch=lambda estimator: seen.append(estimator.weights),
+    )
+    assert told.estimate.dominant_terrain()[-1] == "asphalt"
+    assert (seen[-1].detector.credit.value == 1.0) == believed
+    policy, classes = seen[-1].policy, seen[-1].detector.classes
+    mud = classes.index("mud")
+    assert seen[-1]._driven.posterior()[0][mud] == policy.slips()[0][mud]
