@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from tests.studies.study import OUT, Study, module
 
+SHARES_OF_SLIP = ("in_50", "in_95", "following_50", "following_95")
+"""Columns of the slip model's study: intervals as fitted, and those that follow the run."""
+
 ESTIMATOR = (
     Study(
         "demo_seeds",
@@ -213,16 +216,16 @@ ESTIMATOR = (
         }
         | {
             f"fresh_{what}": r"twin, fresh drives +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
-            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+            for i, what in enumerate(("rmse", "constant", "own_past", *SHARES_OF_SLIP))
         }
         | {
             f"{robot}_{what}": rf"real, {robot} +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
             for robot in ("warthog", "husky", "pathfinder")
-            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+            for i, what in enumerate(("rmse", "constant", "own_past", *SHARES_OF_SLIP))
         }
         | {
             f"memory_{what}": r"own past, warthog +\d+ +" + r"[\d.]+ +" * i + r"([\d.]+)"
-            for i, what in enumerate(("rmse", "constant", "own_past", "in_50", "in_95"))
+            for i, what in enumerate(("rmse", "constant", "own_past", *SHARES_OF_SLIP))
         }
         | {
             f"slippery_{source}": rf"twin to {source} +\d+ runs: balanced accuracy [\d.]+ by window, ([\d.]+)"

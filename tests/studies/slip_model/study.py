@@ -5,13 +5,15 @@
 A model is fitted to a population of twin drives (`population`) and judged as `ground_split.yaml` says.
 Printed for each test: windows, RMSE of the prediction, of the best constant of the fit, and of the mean slip
 earlier in the same run (which the estimator has anyway, from fixes), share of windows inside the 50 and 95 %
-intervals; then balanced accuracy of slippery against firm, of real logs by their ground, of the twin by slip.
+intervals, and of intervals whose width follows the errors earlier in the run; then balanced accuracy of
+slippery against firm, of real logs by their ground, of the twin by slip.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +27,7 @@ from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.field_runs import catalogued, read_runs
 from tests.studies.slip_model.features import LEAST_ROLLED_M, SlipWindows, windows_of
-from tests.studies.slip_model.model import SlipModel, fit
+from tests.studies.slip_model.model import SHARES, SlipModel, fit
 from tests.studies.slip_model.population import drive
 
 Array = NDArray[np.float64]
@@ -34,6 +36,8 @@ SPLIT = read_yaml(Path(__file__).parents[1] / "ground_split.yaml")
 SLIPS = 0.15
 """Slip above which a window of the twin counts as slippery."""
 SLIPPERY = ("medium_sand", "loose_sand", "sandy_loam", "mud", "ploughed_soil", "snow", "ice")
+STEP = 0.4
+"""Of the logarithm of a width that follows the run, a window (chosen on the drives of the fit)."""
 PRIOR_WINDOWS = 10.0
 """Windows that the constant counts for in the mean of a run so far."""
 
@@ -108,10 +112,28 @@ def slip_line(name: str, model: SlipModel, constant: float, runs: list[Run]) -> 
     own = np.concatenate([so_far(run.windows.slip[run.known], constant) for run in runs])
     mean, sigma = model.predict(x)
     off = np.abs(slip - mean) / sigma
-    inside = [100.0 * float(np.mean(off < factor)) for factor in model.factors]
+    runs_off = np.split(off, np.cumsum([int(run.known.sum()) for run in runs])[:-1])
+    kept = [
+        np.concatenate([inside(one, factor, share) for one in runs_off])
+        for factor, share in zip(model.factors, SHARES, strict=True)
+    ]
+    shares = [100.0 * float(np.mean(x)) for x in (*(off < f for f in model.factors), *kept)]
     rmse = [float(np.sqrt(np.mean((slip - other) ** 2))) for other in (mean, constant, own)]
     errors = f"{rmse[0]:8.3f} {rmse[1]:9.3f} {rmse[2]:8.3f}"
-    return f"{name:34s} {len(slip):6d} {errors} {inside[0]:7.0f} {inside[1]:7.0f}"
+    return f"{name:34s} {len(slip):6d} {errors}" + "".join(f" {share:7.0f}" for share in shares)
+
+
+def inside(off: Array, factor: float, share: float) -> NDArray[np.bool_]:
+    """Which errors (n,) of a run, in predicted sigmas, an interval of a `share` holds.
+
+    It is `factor` sigmas wide at first, and follows the errors before (adaptive conformal inference: Gibbs
+    and Candes 2021, here on the logarithm of the width).
+    """
+    found, width = np.empty(len(off), dtype=bool), factor
+    for i, one in enumerate(off.tolist()):
+        found[i] = one < width
+        width *= math.exp(STEP * (share - float(found[i])))
+    return found
 
 
 def slippery_line(name: str, weights: tuple[Array, Array, Array], runs: list[Run]) -> str:
@@ -172,7 +194,7 @@ def main() -> int:
     fresh = list(twin_runs(int(part["judge"]["first_seed"]), min(count, int(part["judge"]["drives"]))))
     real = list(real_runs())
     constant = float(np.mean(stacked(runs)[1]))
-    print(f"{'':34s} windows  RMSE of: constant own past  50 % in  95 % in")
+    print(f"{'':34s} windows  RMSE of: constant own past  50 % in  95 % in  following the run")
     print(slip_line("twin, fresh drives", model, constant, fresh))
     for by in ("robot", "soil"):
         for name in sorted({getattr(run, by) for run in runs}):
