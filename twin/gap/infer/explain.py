@@ -28,6 +28,7 @@ from terrafusion.twin.gap.infer.reference_gain import ReferenceGains
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns
+from terrafusion.twin.gap.rollout.run_soil import soil_limit
 
 Sets = tuple[str, ...]  # names of effects that act together, sorted
 
@@ -128,7 +129,8 @@ class _Explainer:
     ) -> SignatureBank:
         """The bank simulated where no size is near the best ones, each run on the soil that fits it beside
         the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
-        limit, soil = self.evidence.soil_limit, soil_columns(self.evidence.candidates)
+        candidates = self.evidence.candidates
+        limit, soil = soil_limit(candidates), soil_columns(candidates)
         points = list[SimulatedSize]()
         for i, some in sizes.items():
             law = look.laws.names[i]

@@ -21,6 +21,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
+ROUNDS = 2  # of learning, the first with the noise of the data sheets
 ANY_SIZE = 30.0  # 1 sigma of effects of any size, and of functions of the commands, in their units (assumed)
 LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet (assumed)
 
@@ -39,21 +40,17 @@ def learn_noise(
     judged: Sequence[RunResiduals],
     candidates: Candidates,
     jobs: int = 1,
-    before: dict[str, ResidualNoise] | None = None,
 ) -> dict[str, ResidualNoise]:
     """Scale and correlation in time of the noise, by channel.
 
     Theta, effects and poses are fitted to each reference run (ridge, one typical size) and the residuals are
     noise. Without references the judged runs are used, with effects of any size: or a large one would pass
     for noise.
-
-    Args:
-        before: noise learnt from nearly the same residuals; None: two rounds from that of the data sheets.
     """
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
-    noise, sigma, lags = before or data_sheet_noise(every), initial_state_sigma(candidates), _lags(every)
-    for _ in range(1 if before else 2):
+    noise, sigma, lags = data_sheet_noise(every), initial_state_sigma(candidates), _lags(every)
+    for _ in range(ROUNDS):
         now, series = noise, dict[str, Series]()
         for found in in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs):
             for channel, pairs in found.items():
