@@ -2,9 +2,7 @@
 
 A first look ranks all laws, alone and beside each of the best few, to first order; a second one those that
 looked promising, simulated at their best sizes. The twin is simulated again at the best sizes of the
-promising ones of these, which a close look compares alone and in pairs; what they explain on references is
-subtracted. Where even the best of them leaves more in a channel than the references do, the noise of that
-channel is taken to be larger.
+promising ones of these, which a close look compares alone and in pairs.
 """
 
 from __future__ import annotations
@@ -23,8 +21,7 @@ from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
-from terrafusion.twin.gap.infer.reference_gain import ReferenceGains
+from terrafusion.twin.gap.infer.predictive import Metric, Products, metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns
@@ -36,9 +33,8 @@ FIRST, BESIDE, TRIED = 12, 5, 4
 """Laws that get a close look: the best alone, and the best beside each of the best few."""
 SECOND, GROWTH = 18, 3.0
 """Best laws alone that get a second look, and the factor from a best size to the next one simulated there."""
-ROUNDS = 2  # in which the twin is simulated at the best sizes; in which channels are weighted
+ROUNDS = 2  # in which the twin is simulated at the best sizes
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
-LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
 much as a law is wrong."""
@@ -80,17 +76,14 @@ class _Explainer:
     robot: RobotOffsets
     without: Collection[str]
 
-    def metric(self, runs: Sequence[Products], weight: Array | None = None) -> Metric:
-        weight = np.ones(len(self.evidence.channels)) if weight is None else weight
-        return metric(runs, weight, self.sigma, self.robot)
+    def metric(self, runs: Sequence[Products]) -> Metric:
+        return metric(runs, self.sigma, self.robot)
 
-    def look(
-        self, bank: SignatureBank, runs: list[Products] | None = None, weight: Array | None = None
-    ) -> _Look:
-        """At the judged runs, or at their products with further columns, with channels weighted (C,)."""
+    def look(self, bank: SignatureBank, runs: list[Products] | None = None) -> _Look:
+        """At the judged runs, or at their products with further columns."""
         columns = zip(self.evidence.runs, bank.columns(), strict=True)
         runs = [Products.of(r, s) for r, s in columns] if runs is None else runs
-        m = self.metric(runs, weight)
+        m = self.metric(runs)
         return _Look(bank, runs, m, Laws.of(self.evidence.candidates, bank.ladders(), m.shared, m.none))
 
     def alone(self, look: _Look) -> dict[int, Fitted]:
@@ -165,21 +158,6 @@ class _Explainer:
         each = 0.5 * (square * (vectors.T @ m.K[basis, m.error]) ** 2 / grown - np.log(grown)).sum(axis=1)
         return float(np.logaddexp.reduce(each) - math.log(len(each)))
 
-    def reference_energies(self) -> Array:
-        """(C,) mean squared error of each channel of the references, one without them."""
-        ones, none = np.ones(len(self.evidence.channels)), np.zeros(0)
-        own = [Products.of(r, np.zeros((len(r.time_s), 0))) for r in self.evidence.references]
-        each = [energies(run, none, ones, self.sigma, self.robot) for run in own]
-        return np.maximum(np.mean(each, axis=0), LEAST_NORMAL) if each else ones
-
-    def weights(self, runs: Sequence[Products], best: Fitted, weight: Array, normal: Array) -> Array:
-        """(C,) one over the factor by which the best set's rest is above the references', at least one."""
-        P = runs[0].shared
-        moved = dataclasses.replace(self.robot, mean=self.robot.mean + best.used[:P])
-        used = best.used[P:-2]
-        now = np.mean([energies(run, used, weight, self.sigma, moved) for run in runs], axis=0)
-        return np.asarray(1.0 / np.maximum(now / normal, 1.0))
-
 
 def explain(
     evidence: GapEvidence,
@@ -215,37 +193,25 @@ def explain(
     runs, extra = products_with_discrepancy(
         evidence.runs, evidence.model, look.bank, {i: used[i] for i in sizes}
     )
-    weight, before, normal = np.ones(len(evidence.channels)), np.zeros(0), own.reference_energies()
-    for _ in range(ROUNDS):
-        look = own.look(look.bank, runs, weight)
-        found = CloseLook(look.metric, look.laws, tuple(sizes), extra).search()
-        top = max(found, key=lambda laws: found[laws].evidence - 5.0 * len(laws))
-        before, weight = weight, own.weights(runs, found[top], weight, normal)
-        if np.allclose(before, weight, rtol=0.1):
-            break
-    # Less what the same laws gain on references.
-    singles, laws = {i: found[i,] for i in sizes}, look.laws
-    chance = ReferenceGains.of(evidence, sigma, robot, before, laws, singles)
-    found = {
-        some: dataclasses.replace(fit, evidence=fit.evidence - chance.most(some))
-        for some, fit in found.items()
-    }
+    look = own.look(look.bank, runs)
+    laws = look.laws
+    found = CloseLook(look.metric, laws, tuple(sizes), extra).search()
 
     def left_out(fit: Fitted) -> list[tuple[Array, ...]]:
         if len(runs) == 1:
             return [fit.values]
         some = [laws.names.index(law) for law in fit.laws]
-        parts = [own.metric([r for r in runs if r is not run], before) for run in runs]
+        parts = [own.metric([r for r in runs if r is not run]) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(runs, list(singles.values()))
+    alike = _same_signatures(runs, [found[i,] for i in sizes])
     return _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
 
 
 def _same_signatures(runs: Sequence[Products], fits: Sequence[Fitted]) -> dict[str, set[str]]:
     """By effect, those whose signatures nearly coincide with its own before the ground is fitted."""
     T, out = runs[0].states, dict[str, set[str]]()
-    G = np.sum([run.gram.sum(axis=0)[T:-1, T:-1] for run in runs], axis=0)
+    G = np.sum([run.gram[T:-1, T:-1] for run in runs], axis=0)
     used = np.array([fit.used[:-2] for fit in fits])
     inner = used @ G @ used.T
     size = np.sqrt(np.diag(inner))

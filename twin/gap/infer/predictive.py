@@ -9,7 +9,6 @@ is made of, its log likelihood ratio is w'K e - w'K w / 2.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,29 +22,23 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Inner products of a run's columns by channel: states, effects and nuisance, signatures, error.
+    """Inner products of a run's columns: states, effects and nuisance, signatures, error.
 
-    `states` and `shared` are the numbers of the first two; `samples` (C,) that of each channel.
+    `states` and `shared` are the numbers of the first two.
     """
 
     gram: Array
     states: int
     shared: int
-    samples: Array
 
     @classmethod
     def of(cls, run: WhitenedRun, signatures: Array) -> Products:
         """Of a run and its signatures (n, Q)."""
-        rows = run.rows.astype(float)
-        X = np.column_stack([rows[:, :-1], signatures, rows[:, -1]])
-        ends = np.searchsorted(run.channel, np.arange(len(run.limit) + 1))  # samples are sorted by channel
-        gram = np.stack([X[a:b].T @ X[a:b] for a, b in itertools.pairwise(ends)])
-        return cls(gram, run.states, rows.shape[1] - 1 - run.states, np.diff(ends).astype(float))
+        return cls(run.gram_with(signatures), run.states, len(run.gram) - 1 - run.states)
 
     def fitted_states(self, used: Array, sigma: Array, robot: RobotOffsets) -> Array:
         """States (T,) that fit what signatures leave; `used` are coefficients of all columns but states."""
-        T, P = self.states, self.shared
-        G = self.gram.sum(axis=0)
+        T, P, G = self.states, self.shared, self.gram
         v = np.concatenate([-used, [1.0]])
         v[:P] -= robot.mean
         return np.asarray(np.linalg.solve(G[:T, :T] + np.diag(sigma**-2.0), G[:T, T:] @ v))
@@ -70,17 +63,12 @@ class Metric:
         return len(self.K) - 1
 
 
-def metric(runs: Sequence[Products], weight: Array, sigma: Array, robot: RobotOffsets) -> Metric:
-    """The metric of judged runs.
-
-    Args:
-        weight: (C,) of each channel: one over the factor of its noise's variance.
-        sigma: (T,) 1 sigma of the states.
-    """
+def metric(runs: Sequence[Products], sigma: Array, robot: RobotOffsets) -> Metric:
+    """The metric of judged runs; `sigma` (T,) is that of the states."""
     P = runs[0].shared
-    total = np.zeros((runs[0].gram.shape[1] - len(sigma),) * 2)
+    total = np.zeros((len(runs[0].gram) - len(sigma),) * 2)
     for run in runs:
-        rest = without_states(np.tensordot(weight, run.gram, axes=1), sigma)
+        rest = without_states(run.gram, sigma)
         rest[:, -1] -= rest[:, :P] @ robot.mean
         rest[-1] -= robot.mean @ rest[:P]
         total += marginalise_run_offsets(rest, robot)
@@ -100,16 +88,3 @@ def marginalise_robot_offsets(products: Array, robot: RobotOffsets) -> Array:
     P, V = len(robot.mean), robot.covariance
     own = np.linalg.solve(np.eye(P) + V @ products[:P, :P], V @ products[:P])
     return products - products[:, :P] @ own
-
-
-def energies(run: Products, used: Array, weight: Array, sigma: Array, robot: RobotOffsets) -> Array:
-    """Mean squared error (C,) of each channel with signatures (coefficients (Q,)) subtracted and the best
-    states and robot offsets beside them."""
-    T, P = len(sigma), run.shared
-    G = np.tensordot(weight, run.gram, axes=1)
-    v = np.concatenate([np.zeros(T), -robot.mean, -used, [1.0]])
-    prior = np.zeros((T + P, T + P))
-    prior[:T, :T] = np.diag(sigma**-2.0)
-    prior[T:, T:] = np.linalg.inv(robot.covariance + np.diag(robot.scatter))
-    v[: T + P] -= np.linalg.solve(G[: T + P, : T + P] + prior, G[: T + P] @ v)
-    return np.maximum(np.einsum("cij,i,j->c", run.gram, v, v), 1e-9) / np.maximum(run.samples, 1.0)

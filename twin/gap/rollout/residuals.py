@@ -42,6 +42,7 @@ CURRENTS = ("current_left_a", "current_right_a")
 LEAST_OFFSET_A, LEAST_GAIN = 0.05, 1e-3  # least 1 sigma of those (assumed)
 SAME_YAW_RAD = 0.2
 """Runs with equal commands share a linearisation if they start within such a sector of headings."""
+CHUNK = 4096  # samples that are multiplied at once in 64 bits: a copy of all would not stay in the cache
 OUTLIER_SIGMAS, ROBUST_STEPS = 4.0, 8
 """Errors beyond so many sigmas do not pull on a run's states (1 in 16 000 normal errors is); steps of that
 fit."""
@@ -137,12 +138,19 @@ class WhitenedRun:
     def with_columns(self, columns: Array) -> Self:
         """With further whitened columns (n, D) behind those of effects and nuisance."""
         rows = np.column_stack([self.rows[:, :-1], columns.astype(np.float32), self.rows[:, -1]])
-        inner, first = rows.astype(float).T @ columns, self.rows.shape[1] - 1
-        new = np.arange(first, first + columns.shape[1])
-        old = np.delete(np.arange(rows.shape[1]), new)
-        gram = np.empty((rows.shape[1],) * 2)
-        gram[np.ix_(old, old)], gram[:, new], gram[new] = self.gram, inner, inner.T
-        return dataclasses.replace(self, rows=rows, gram=gram)
+        return dataclasses.replace(self, rows=rows, gram=self.gram_with(columns))
+
+    def gram_with(self, columns: Array) -> Array:
+        """`gram` with further whitened columns (n, D) behind those of effects and nuisance."""
+        size, D = len(self.gram), columns.shape[1]
+        new, inner = np.arange(size - 1, size - 1 + D), np.zeros((size, D))
+        for i in range(0, len(columns), CHUNK):
+            inner += self.rows[i : i + CHUNK].astype(float).T @ columns[i : i + CHUNK]
+        old = np.append(np.arange(size - 1), size - 1 + D)
+        gram = np.empty((size + D, size + D))
+        gram[np.ix_(old, old)], gram[np.ix_(old, new)], gram[np.ix_(new, old)] = self.gram, inner, inner.T
+        gram[np.ix_(new, new)] = columns.T @ columns
+        return gram
 
     def state_information(self, sigma: Array) -> Array:
         """(T, T) information of the states with their prior of 1 sigma (T,)."""
