@@ -7,11 +7,12 @@ the nearness; heading and position keep what they gained there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import COARSE_STEP, Indices
 from terrafusion.twin.physics.layout import OUTPUTS
 
@@ -30,16 +31,15 @@ _EAST, _NORTH = OUTPUTS.index("gnss_east_m"), OUTPUTS.index("gnss_north_m")
 _RATE, _SPEED = OUTPUTS.index("yaw_rate_radps"), OUTPUTS.index("speed_mps")
 
 
-def patch_columns(
-    y: Array, by_effect: Array, counts: Indices, candidates: Candidates, track_m: float
-) -> Array:
+def patch_columns(y: Array, slopes: Mapping[str, Array], counts: Indices, track_m: float) -> Array:
     """Derivatives (n, Y, D) of the outputs by independent changes of the ground in a window, of 1 sigma.
 
     Args:
-        y, by_effect: (n, Y) outputs and (n, Y, K) their sensitivities, at the coarse samples of all windows.
+        y: (n, Y) outputs at the coarse samples of all windows.
+        slopes: (n, Y) their sensitivities by the parameters that were asked for, in typical sizes.
         counts: (W,) number of samples of each window.
     """
-    ground = [(candidates.keys.index(k), s) for k, s in PATCH_SIGMAS.items() if k in candidates.keys]
+    ground = [(slopes[k], sigma) for k, sigma in PATCH_SIGMAS.items() if k in slopes]
     ends = np.cumsum(counts)
     spans = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
     weights = [_weights(y[span], track_m) for span in spans]
@@ -48,9 +48,9 @@ def patch_columns(
     root = np.linalg.cholesky(np.exp(-np.abs(place[:, None] - place) / LENGTH_M))
     out = np.zeros((*y.shape, len(ground), most))
     for span, weight in zip(spans, weights, strict=True):
-        for g, (column, sigma) in enumerate(ground):
+        for g, (slope, sigma) in enumerate(ground):
             own = weight @ root[: weight.shape[1]]
-            out[span, :, g] = _local(y[span], sigma * by_effect[span, :, column], own)
+            out[span, :, g] = _local(y[span], sigma * slope[span], own)
     return out.reshape(*y.shape, len(ground) * most)
 
 

@@ -177,14 +177,17 @@ def linearise(
             sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
     fine, coarse, read = _readings(log, model, candidates, start, sets)
     y = read[NOMINAL]
-    by_effect = np.zeros((*y.shape, len(candidates.keys)))
-    for i, k in enumerate(candidates.keys):
-        if k in read:
-            by_effect[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
-    diverged = ~np.isfinite(by_effect).all(axis=(0, 1))
-    by_effect[:, :, diverged] = 0.0
-    by_patch = patch_columns(y, by_effect, coarse_counts(log), candidates, model.vehicle.body.track_m)
-    columns = np.concatenate([_by_pose(log, coarse, y), by_effect, by_patch], axis=2)
+    slopes = {
+        k: (read[k] - y) * (scale / steps[k])
+        for k, scale in zip(candidates.keys, candidates.scale, strict=True)
+        if k in read and np.isfinite(read[k]).all()  # of a run that diverged, the column is zero
+    }
+    by_patch, K = patch_columns(y, slopes, coarse_counts(log), model.vehicle.body.track_m), len(steps)
+    columns = np.zeros((*y.shape, 3 + K + by_patch.shape[2]))
+    columns[:, :, :3], columns[:, :, 3 + K :] = _by_pose(log, coarse, y), by_patch
+    for i, k in enumerate(candidates.keys, start=3):
+        if k in slopes:
+            columns[:, :, i] = slopes[k]
     return Linearisation(start, fine, columns, coarse[:, INDEX["yaw"]])
 
 
