@@ -28,6 +28,9 @@ CHANGE_FREEDOM = 4
 JITTER = 0.02  # variance added to a standardised score (assumed): no combination of them is taken as exact
 WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)
 """1 sigma of an effect's size, in typical ones, and those of an unknown cause's (assumed)."""
+LEAST_MEAN = (
+    1e-12  # least mean square of a deviation: columns that the logs have no channel for deviate by none
+)
 REPLICATES, LOWEST = 1000, 20
 """Replicates, and how many of the lowest show the tail, where p-values are proportional to the statistic."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost
@@ -105,12 +108,14 @@ class Deviations:
     def of(cls, A: Array, parts: Sequence[Array], references: float, candidates: Candidates) -> Deviations:
         """Of scores with the information A (P, P) and a covariance in three `parts`: what is known, change on
         other drives, and scatter from run to run, known from so many references, three at least."""
-        blocks = _blocks(A, sum(parts[1:], parts[0]), candidates)
+        spread = sum(parts[1:], parts[0])
+        every = _blocks(A, spread, candidates)
+        blocks = [block for block in every if float((block * (spread @ block)).sum()) > LEAST_MEAN]
         maps, widths = np.hstack(blocks), [block.shape[1] for block in blocks]
         first = np.cumsum([0, *widths[:-1]])
-        every = [maps.T @ part @ maps for part in parts]
+        mapped = [maps.T @ part @ maps for part in parts]
         cells = [slice(a, a + w) for a, w in zip(first, widths, strict=True)]
-        inner = [[part[cell, cell] for part in every] for cell in cells]
+        inner = [[part[cell, cell] for part in mapped] for cell in cells]
         changes = _factors(CHANGE_FREEDOM) if parts[1].any() else (np.ones(1), np.ones(1))
         factors = changes, _factors(references)
         expected = 1.0, *(f / (f - 2.0) for f in (CHANGE_FREEDOM, references))  # of an inverse chi-squared
@@ -180,7 +185,7 @@ def _log_tail(
     first = np.tensordot([np.trace(part) for part in inner], factor, axes=1)
     cross = [[float((a * b.T).sum()) for b in inner] for a in inner]
     second = np.einsum("ij,iab,jab->ab", cross, factor, factor)
-    x = np.maximum(mean, 1e-12) * GRID[:, None, None] * (0.5 * first / np.maximum(second, 1e-24))
+    x = mean * GRID[:, None, None] * (0.5 * first / np.maximum(second, 1e-24))
     if len(inner[0]) == 1:
         tails = erfc(np.sqrt(x))
     else:

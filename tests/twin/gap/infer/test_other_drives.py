@@ -267,6 +267,22 @@ def test_offsets_are_certain_beyond_their_noise() -> None:
     np.testing.assert_allclose(robot.certain(), [certain, -certain, 0.0])
 
 
+def test_columns_that_a_log_has_no_channel_for_are_no_gap() -> None:
+    """A form of one column and one of two."""
+    candidates = Candidates.of(["gyro_bias", "gyro_scale", "accel_bias"])
+    silent = [i for i, key in enumerate(candidates.keys) if not key.startswith("gyro_bias")]
+    J = np.random.default_rng(4).standard_normal((ROWS, len(candidates.keys) + 4))
+    J[:, silent] = 0.0
+    rng, found = np.random.default_rng(5), list[float]()
+    for _ in range(20):
+        made = [Score(J.T @ rng.standard_normal(ROWS), J.T @ J) for _ in range(7)]
+        detection = detect(made[:1], learn_offsets(made[1:], len(candidates.keys)), candidates, 0)
+        assert np.isfinite(detection.statistic)
+        found.append(detection.p_value)
+    assert max(found) > 0.5
+    assert sum(p <= 0.05 for p in found) <= 3
+
+
 def test_beyond_all_replicates_the_p_value_goes_on_falling() -> None:
     large, larger = (p_value(3, "reference", effect=size) for size in (30.0, 300.0))
     assert larger < large < 1.0 / 1001.0
