@@ -33,7 +33,6 @@ FIRST, BESIDE, TRIED = 12, 5, 4
 """Laws that get a close look: the best alone, and the best beside each of the best few."""
 SECOND, GROWTH = 18, 3.0
 """Best laws alone that get a second look, and the factor from a best size to the next one simulated there."""
-ROUNDS = 2  # in which the twin is simulated at the best sizes
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
@@ -117,13 +116,12 @@ class _Explainer:
                 points += [SimulatedSize(law, x, soils) for x in new if abs(x) > LEAST_SIZE]
         return look.bank.with_sizes(self.evidence, points)
 
-    def with_best_sizes(
-        self, look: _Look, sizes: Mapping[int, list[float]], used: Sequence[Array]
-    ) -> SignatureBank:
+    def with_best_sizes(self, look: _Look, sizes: Mapping[int, list[float]]) -> SignatureBank:
         """The bank simulated where no size is near the best ones, each run on the soil that fits it beside
         the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
         candidates = self.evidence.candidates
         limit, soil = soil_limit(candidates), soil_columns(candidates)
+        _, _, used = look.laws.best(look.metric)
         points = list[SimulatedSize]()
         for i, some in sizes.items():
             law = look.laws.names[i]
@@ -137,17 +135,6 @@ class _Explainer:
             new = [x for x in dict.fromkeys(some) if np.abs(known - x).min() > _near(x)]
             points += [SimulatedSize(law, x, soils) for x in new]
         return look.bank.with_sizes(self.evidence, points)
-
-    def until_simulated(self, look: _Look, sizes: Mapping[int, list[float]]) -> tuple[_Look, list[Array]]:
-        """The look with a bank that is simulated near the best sizes of some laws, and the coefficients of
-        each law at its best there."""
-        _, _, used = look.laws.best(look.metric)
-        for _ in range(ROUNDS):
-            look = self.look(self.with_best_sizes(look, sizes, used))
-            gains, values, used = look.laws.best(look.metric)
-            _, beside, _ = look.laws.best(look.metric, used[max(sizes, key=lambda i: gains[i])])
-            sizes = {i: [float(v[i][0]) for v in (values, beside)[: len(s)]] for i, s in sizes.items()}
-        return look, used
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
@@ -186,14 +173,14 @@ def explain(
     # Second look: the twin simulated at the sizes of the first.
     look = own.look(own.with_first_sizes(look, own.promising(look, alone, SECOND)))
     alone = own.alone(look)
-    # The most promising laws alone, simulated until the best sizes are among those simulated.
+    # The most promising laws alone, simulated where no size is near the best one.
     sizes = own.promising(look, alone, FIRST)
-    look, used = own.until_simulated(own.look(look.bank.only(look.laws.names[i] for i in sizes)), sizes)
+    bank = own.with_best_sizes(look, sizes).only(look.laws.names[i] for i in sizes)
+    look = own.look(bank)
+    _, _, used = look.laws.best(look.metric)
     # Close look: alone and in pairs, each with the discrepancy of its law.
-    runs, extra = products_with_discrepancy(
-        evidence.runs, evidence.model, look.bank, {i: used[i] for i in sizes}
-    )
-    look = own.look(look.bank, runs)
+    runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, {i: used[i] for i in sizes})
+    look = own.look(bank, runs)
     laws = look.laws
     found = CloseLook(look.metric, laws, tuple(sizes), extra).search()
 
