@@ -50,7 +50,10 @@ def _stretches(run: WhitenedRun) -> Iterator[tuple[int, Indices, float]]:
         own = error[place : place + len(rows)]
         place += len(rows)
         parts = max(len(rows) // STRETCH, 1)
-        for some, values in zip(np.array_split(rows, parts), np.array_split(own, parts), strict=True):
-            if len(values) > 2:
-                square = np.median(np.square(np.diff(values)))
-                yield channel, some, 0.5 * float(square) / NORMAL_MEDIAN
+        size, longer = divmod(len(rows), parts)  # so many stretches are longer by a sample
+        first = longer * (size + 1)
+        for n, at in ((size + 1, slice(first)), (size, slice(first, None))):
+            if n > 2:
+                square = np.median(np.square(np.diff(own[at].reshape(-1, n))), axis=1)
+                for some, variance in zip(rows[at].reshape(-1, n), square, strict=True):
+                    yield channel, some, 0.5 * float(variance) / NORMAL_MEDIAN
