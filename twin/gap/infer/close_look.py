@@ -39,20 +39,15 @@ class CloseLook:
     index: tuple[int, ...]
     extra: Mapping[int, Array]
 
-    def with_discrepancy(self, laws: Sequence[int]) -> tuple[Metric, float]:
-        """The metric with the discrepancy of some laws in the covariance, and what that adds to the log
-        likelihood of no effect."""
+    def fit(self, laws: Sequence[int]) -> Fitted:
+        """Some laws together, with the discrepancy of each in the covariance."""
         D, K, e = np.concatenate([self.extra[i] for i in laws]), self.metric.K, self.metric.error
         L = np.linalg.cholesky(K[np.ix_(D, D)] + np.eye(len(D)) / DISCREPANCY**2)
         half = np.linalg.solve(L, K[D])
         less = half.T @ half
-        share = 0.5 * less[e, e] - float(np.log(np.diag(L)).sum()) - len(D) * math.log(DISCREPANCY)
-        return Metric(K - less, self.metric.shared), float(share)
-
-    def fit(self, laws: Sequence[int]) -> Fitted:
-        """Some laws together."""
-        metric, share = self.with_discrepancy(laws)
-        found = self.laws.fit(metric, laws)
+        found = self.laws.fit(Metric(K - less, self.metric.shared), laws)
+        # What the discrepancy adds to the log likelihood of no effect.
+        share = 0.5 * float(less[e, e]) - float(np.log(np.diag(L)).sum()) - len(D) * math.log(DISCREPANCY)
         return dataclasses.replace(found, gain=found.gain + share, evidence=found.evidence + share)
 
     def search(self) -> dict[tuple[int, ...], Fitted]:
@@ -79,20 +74,22 @@ class CloseLook:
 
 
 def products_with_discrepancy(
-    runs: Sequence[WhitenedRun], model: Model, bank: SignatureBank, used: Mapping[int, Array]
+    runs: Sequence[WhitenedRun], model: Model, bank: SignatureBank, used: Mapping[int, Array], weight: Array
 ) -> tuple[list[Products], dict[int, Array]]:
     """Inner products of the runs with the discrepancy of laws among the columns, and its columns in the
     metric.
 
     Args:
         used: (M + 1,) coefficients of each law's signature at its size.
+        weight: (C,) of each channel: one over the factor of its noise's variance.
     """
     columns, F, out = bank.columns(), len(FUNCTIONS) + 1, list[Products]()
     first = runs[0].by_parameter.shape[1] + columns[0].shape[1]
     for run, signatures in zip(runs, columns, strict=True):
         f, own = modulation(run, model), np.column_stack([run.by_parameter, signatures])
         parts = [(own @ w[: own.shape[1]])[:, None] * f for w in used.values()]
-        out.append(Products.of(run, np.column_stack([signatures, *parts])))
+        root = np.sqrt(weight)[run.channel][:, None]
+        out.append(Products.of(run.weighted(weight), root * np.column_stack([signatures, *parts])))
     return out, {i: first + F * k + np.arange(F) for k, i in enumerate(used)}
 
 

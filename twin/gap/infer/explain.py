@@ -2,7 +2,8 @@
 
 A first look ranks all laws, alone and beside each of the best few, to first order; a second one those that
 looked promising, simulated at their best sizes. The twin is simulated again at the best sizes of the
-promising ones of these, which a close look compares alone and in pairs.
+promising ones of these, which a close look compares alone and in pairs. Where even the best of them leaves
+more in a channel than the references do, the noise of that channel is taken to be larger.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import Metric, Products, metric
+from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns
@@ -33,6 +34,8 @@ FIRST, BESIDE, TRIED = 12, 5, 4
 """Laws that get a close look: the best alone, and the best beside each of the best few."""
 SECOND, GROWTH = 18, 3.0
 """Best laws alone that get a second look, and the factor from a best size to the next one simulated there."""
+WEIGHINGS = 2  # of channels
+LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
@@ -75,14 +78,11 @@ class _Explainer:
     robot: RobotOffsets
     without: Collection[str]
 
-    def metric(self, runs: Sequence[Products]) -> Metric:
-        return metric(runs, self.sigma, self.robot)
-
     def look(self, bank: SignatureBank, runs: list[Products] | None = None) -> _Look:
         """At the judged runs, or at their products with further columns."""
         columns = zip(self.evidence.runs, bank.columns(), strict=True)
         runs = [Products.of(r, s) for r, s in columns] if runs is None else runs
-        m = self.metric(runs)
+        m = metric(runs, self.sigma, self.robot)
         return _Look(bank, runs, m, Laws.of(self.evidence.candidates, bank.ladders(), m.shared, m.none))
 
     def alone(self, look: _Look) -> dict[int, Fitted]:
@@ -145,6 +145,26 @@ class _Explainer:
         each = 0.5 * (square * (vectors.T @ m.K[basis, m.error]) ** 2 / grown - np.log(grown)).sum(axis=1)
         return float(np.logaddexp.reduce(each) - math.log(len(each)))
 
+    def normal_energies(self) -> Array:
+        """(C,) mean squared error of each channel of the references, one without them."""
+        each, none = list[Array](), np.zeros(0)
+        for run in self.evidence.references:
+            products = Products(run.gram, run.states, len(self.robot.mean))
+            each.append(energies(run, products, none, run.error, self.sigma, self.robot))
+        return (
+            np.maximum(np.mean(each, axis=0), LEAST_NORMAL) if each else np.ones(len(self.evidence.channels))
+        )
+
+    def weights(self, look: _Look, best: Fitted, normal: Array) -> Array:
+        """(C,) one over the factor by which the best set's rest is above the references', at least one."""
+        P, now = look.metric.shared, list[Array]()
+        moved = dataclasses.replace(self.robot, mean=self.robot.mean + best.used[:P])
+        used = best.used[P:-2]
+        for run, products, own in zip(self.evidence.runs, look.runs, look.bank.columns(), strict=True):
+            left = run.error - own @ used[: own.shape[1]]
+            now.append(energies(run, products, used, left, self.sigma, moved))
+        return np.asarray(1.0 / np.maximum(np.mean(now, axis=0) / normal, 1.0))
+
 
 def explain(
     evidence: GapEvidence,
@@ -179,19 +199,30 @@ def explain(
     look = own.look(bank)
     _, _, used = look.laws.best(look.metric)
     # Close look: alone and in pairs, each with the discrepancy of its law.
-    runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, {i: used[i] for i in sizes})
-    look = own.look(bank, runs)
-    laws = look.laws
-    found = CloseLook(look.metric, laws, tuple(sizes), extra).search()
+    wanted, weight, normal = (
+        {i: used[i] for i in sizes},
+        np.ones(len(evidence.channels)),
+        own.normal_energies(),
+    )
+    plain = list[Products]()
+    for _ in range(WEIGHINGS):
+        runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, wanted, weight)
+        plain, look = plain or runs, own.look(bank, runs)
+        laws = look.laws
+        found = CloseLook(look.metric, laws, tuple(sizes), extra).search()
+        top = max(found, key=lambda some: found[some].evidence - 5.0 * len(some))
+        before, weight = weight, own.weights(look, found[top], normal)
+        if np.allclose(before, weight, rtol=0.1):
+            break
 
     def left_out(fit: Fitted) -> list[tuple[Array, ...]]:
         if len(runs) == 1:
             return [fit.values]
         some = [laws.names.index(law) for law in fit.laws]
-        parts = [own.metric([r for r in runs if r is not run]) for run in runs]
+        parts = [metric([r for r in runs if r is not run], sigma, robot) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(runs, [found[i,] for i in sizes])
+    alike = _same_signatures(plain, [found[i,] for i in sizes])
     return _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
 
 

@@ -88,3 +88,26 @@ def marginalise_robot_offsets(products: Array, robot: RobotOffsets) -> Array:
     P, V = len(robot.mean), robot.covariance
     own = np.linalg.solve(np.eye(P) + V @ products[:P, :P], V @ products[:P])
     return products - products[:, :P] @ own
+
+
+def energies(
+    run: WhitenedRun, products: Products, used: Array, left: Array, sigma: Array, robot: RobotOffsets
+) -> Array:
+    """Mean squared error (C,) of each channel, in white units, with signatures subtracted and the best states
+    and robot offsets beside them.
+
+    Args:
+        products: of the run, or of it with channels weighted, by which states and offsets are fitted.
+        used: coefficients of all columns of `products` behind those of states, effects and nuisance.
+        left: (n,) error less the signatures.
+    """
+    T, P, G = len(sigma), products.shared, products.gram
+    v = np.concatenate([np.zeros(T), -robot.mean, -used, [1.0]])
+    prior = np.zeros((T + P, T + P))
+    prior[:T, :T] = np.diag(sigma**-2.0)
+    prior[T:, T:] = np.linalg.inv(robot.covariance + np.diag(robot.scatter))
+    v[: T + P] -= np.linalg.solve(G[: T + P, : T + P] + prior, G[: T + P] @ v)
+    square = (left + run.rows[:, :-1] @ v[: T + P].astype(np.float32)) ** 2
+    samples = np.bincount(run.channel, minlength=len(run.limit))
+    found = np.bincount(run.channel, square, len(run.limit))
+    return np.maximum(found / np.maximum(samples, 1), 1e-9)

@@ -143,14 +143,19 @@ class WhitenedRun:
     def gram_with(self, columns: Array) -> Array:
         """`gram` with further whitened columns (n, D) behind those of effects and nuisance."""
         size, D = len(self.gram), columns.shape[1]
-        new, inner = np.arange(size - 1, size - 1 + D), np.zeros((size, D))
-        for i in range(0, len(columns), CHUNK):
-            inner += self.rows[i : i + CHUNK].astype(float).T @ columns[i : i + CHUNK]
+        new, inner = np.arange(size - 1, size - 1 + D), inner_products(self.rows, columns)
         old = np.append(np.arange(size - 1), size - 1 + D)
         gram = np.empty((size + D, size + D))
         gram[np.ix_(old, old)], gram[np.ix_(old, new)], gram[np.ix_(new, old)] = self.gram, inner, inner.T
         gram[np.ix_(new, new)] = columns.T @ columns
         return gram
+
+    def weighted(self, weight: Array) -> Self:
+        """With columns and error of each channel times the root of its weight (C,)."""
+        if (weight == 1.0).all():
+            return self
+        rows = self.rows * np.sqrt(weight)[self.channel].astype(np.float32)[:, None]
+        return dataclasses.replace(self, rows=rows, gram=inner_products(rows, rows))
 
     def state_information(self, sigma: Array) -> Array:
         """(T, T) information of the states with their prior of 1 sigma (T,)."""
@@ -177,6 +182,14 @@ class WhitenedRun:
             U = self.patch_basis[mine]
             out[mine] += U @ ((U.T @ out[mine]) / (1.0 - np.square(U).sum(axis=0)))
         return out
+
+
+def inner_products(rows: NDArray[np.float32], columns: NDArray[np.float32] | Array) -> Array:
+    """Of rows (n, M) and columns (n, D), in 64 bits."""
+    out = np.zeros((rows.shape[1], columns.shape[1]))
+    for i in range(0, len(rows), CHUNK):
+        out += rows[i : i + CHUNK].astype(float).T @ columns[i : i + CHUNK].astype(float)
+    return out
 
 
 def _less(columns: Array, basis: Array, window: Indices) -> Array:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import Products, metric
-from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+from terrafusion.twin.gap.infer.predictive import Products, energies, metric
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, inner_products
 
 T, P, Q, N = 2, 3, 2, 65
 SIGMA = np.array([0.5, 2.0])
@@ -69,12 +68,58 @@ def test_states_are_held_by_their_prior() -> None:
     np.testing.assert_allclose(products.fitted_states(used, sigma, ROBOT), wanted)
 
 
+def in_two_channels(X: np.ndarray) -> WhitenedRun:
+    """A run without signatures, whose first 40 samples are of one channel."""
+    rows, none = np.delete(X, range(T + P, T + P + Q), axis=1).astype(np.float32), np.zeros(0)
+    channel, gram = np.repeat([0, 1], [40, N - 40]), inner_products(rows, rows)
+    residuals: Any = None
+    return WhitenedRun(residuals, gram, rows, none, none, channel, none, channel, T, none, np.ones(2))
+
+
+def test_what_states_and_robot_explain_is_no_energy() -> None:
+    X, _ = run(3)
+    noise = 0.1 * np.random.default_rng(4).standard_normal(N)
+    used = np.array([1.5, -2.0])
+    error = X[:, :T] @ (0.5, 1.0) + X[:, T : T + P] @ ROBOT.mean + X[:, T + P : -1] @ used + noise
+    X, products = run(3, error)
+    with_it, without = (
+        energies(in_two_channels(X), products, u, error - X[:, T + P : -1] @ u, SIGMA, ROBOT)
+        for u in (used, 0.0 * used)
+    )
+    assert (with_it < 0.1).all()
+    assert (without > 1.0).all()
+
+
+def test_priors_hold_states_and_robot_where_energy_is_counted() -> None:
+    """Against least squares with the priors as rows; the second channel counts for a quarter."""
+    X, _ = run(6)
+    used, weight = np.array([0.3, -0.4]), np.repeat([1.0, 0.25], [40, N - 40])
+    offsets = ROBOT.covariance + np.diag(ROBOT.scatter)
+    rows = np.sqrt(weight)[:, None]
+    left = X[:, -1] - X[:, T + P : -1] @ used
+    prior = np.zeros((T + P, T + P))
+    prior[:T, :T], prior[T:, T:] = np.diag(1.0 / SIGMA), np.linalg.cholesky(np.linalg.inv(offsets)).T
+    A, own = np.vstack([rows * X[:, : T + P], prior]), left - X[:, T : T + P] @ ROBOT.mean
+    best = np.linalg.lstsq(A, np.concatenate([rows[:, 0] * own, np.zeros(T + P)]), rcond=None)[0]
+    square = (own - X[:, : T + P] @ best) ** 2
+    products = Products((rows * X).T @ (rows * X), T, P)
+    found = energies(in_two_channels(X), products, used, left, SIGMA, ROBOT)
+    np.testing.assert_allclose(found, [square[:40].mean(), square[40:].mean()], rtol=1e-4)
+
+
+def test_a_weight_of_a_channel_is_that_of_its_squares() -> None:
+    X, _ = run(8)
+    plain = in_two_channels(X)
+    assert plain.weighted(np.ones(2)) is plain
+    rows = plain.rows * np.repeat([1.0, 0.5], [40, N - 40])[:, None]
+    np.testing.assert_allclose(
+        plain.weighted(np.array([1.0, 0.25])).gram, rows.T @ rows, rtol=1e-5, atol=1e-5
+    )
+
+
 def test_products_with_signatures_are_those_of_all_columns() -> None:
     X, _ = run(7)
-    rows = np.delete(X, [T + P, T + P + 1], axis=1).astype(np.float32)
-    X[:, [*range(T + P), -1]] = rows  # 32 bits, as in a run
-    whitened = SimpleNamespace(rows=rows, gram=rows.astype(float).T @ rows.astype(float), states=T)
-    whitened.gram_with = functools.partial(WhitenedRun.gram_with, whitened)
-    found = Products.of(whitened, X[:, T + P : T + P + Q])  # type: ignore[arg-type]
+    X = X.astype(np.float32).astype(float)  # as a run has them
+    found = Products.of(in_two_channels(X), X[:, T + P : T + P + Q])
     np.testing.assert_allclose(found.gram, X.T @ X)
     assert (found.states, found.shared) == (T, P)
