@@ -7,6 +7,8 @@ vehicle and of the sensors predict in all of them, times functions of the comman
 columns of their own. References know their coefficients as far as their drives excite them. These and the
 offsets themselves change from drive to drive, the more the less the commands of judged runs and references
 overlap. Only offsets beyond their uncertainty count: where the twin fits the references, none are wrong.
+Columns that act alike share what they explain (`RobotOffsets.modest`): large offsets of opposite sign, which
+cancel, are no law that could be wrong by as much.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ def with_law_misfit(
         sigma: (T,) 1 sigma of the states.
         robot: offsets without the misfit.
     """
-    groups, certain = _groups(evidence.candidates), robot.certain()
+    plain = [score(run, sigma) for run in evidence.references]
+    groups, certain = _groups(evidence.candidates), robot.modest(plain).certain()
 
     def extended(run: WhitenedRun) -> WhitenedRun:
         return run.with_columns(_columns(run, evidence.model, certain, groups))

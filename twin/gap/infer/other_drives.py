@@ -64,6 +64,13 @@ class RobotOffsets:
         square = self.mean**2 - CERTAIN * np.diag(self.known())
         return np.asarray(np.sign(self.mean) * np.sqrt(np.maximum(square, 0.0)))
 
+    def modest(self, references: Sequence[Score]) -> RobotOffsets:
+        """What the references know with the least prior variance: columns that act alike share what they
+        explain, where a wide prior lets large offsets of opposite sign cancel."""
+        prior = np.ones(len(self.mean))
+        mean, covariance, _ = _posterior(references, self.scatter, prior)
+        return RobotOffsets(mean, covariance, self.scatter, prior, len(references))
+
     def of(self, references: Sequence[Score]) -> RobotOffsets:
         """What some references know, with the same scatter and prior."""
         mean, covariance, _ = _posterior(references, self.scatter, self.prior)

@@ -18,6 +18,12 @@ from terrafusion.twin.gap.rollout.residuals import (
     physical_error,
     whitened,
 )
+from terrafusion.twin.gap.rollout.shared_errors import (
+    ChannelNoise,
+    SharedGains,
+    learn_gains,
+    without_shared,
+)
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
@@ -40,8 +46,8 @@ def learn_noise(
     judged: Sequence[RunResiduals],
     candidates: Candidates,
     jobs: int = 1,
-) -> dict[str, ResidualNoise]:
-    """Scale and correlation in time of the noise, by channel.
+) -> ChannelNoise:
+    """Scale and correlation in time of the noise, by channel, and of the errors that channels share.
 
     Theta, effects and poses are fitted to each reference run (ridge, one typical size) and the residuals are
     noise. Without references the judged runs are used, with effects of any size: or a large one would pass
@@ -49,13 +55,17 @@ def learn_noise(
     """
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
-    noise, sigma, lags = data_sheet_noise(every), initial_state_sigma(candidates), _lags(every)
+    noise = ChannelNoise(data_sheet_noise(every))
+    sigma, lags = initial_state_sigma(candidates), _lags(every)
     for _ in range(ROUNDS):
         now, series = noise, dict[str, Series]()
-        for found in in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs):
-            for channel, pairs in found.items():
+        rests = in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs)
+        gains = learn_gains((run.log, rest) for run, rest in zip(runs, rests, strict=True))
+        for run, rest in zip(runs, rests, strict=True):
+            for channel, pairs in _series(run, now, gains, rest).items():
                 series.setdefault(channel, []).extend(pairs)
-        noise = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
+        found = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
+        noise = ChannelNoise.of(found, gains)
     return noise
 
 
@@ -94,18 +104,30 @@ def _channel_noise(
 
 def _fit_residuals(
     run: RunResiduals, noise: Mapping[str, ResidualNoise], sigma: Array, size: float
-) -> dict[str, Series]:
-    """Residuals of one run after a fit of its states, effects (1 sigma `size`) and poses, in units of the
-    data sheets' sigma, by channel and window."""
+) -> list[Array]:
+    """Residuals of one run after a fit of its states, effects (1 sigma `size`) and poses, one array (n,) a
+    channel, zero outside the windows."""
     white = whitened(run.without_nuisance(), noise)
     prior = np.append(sigma**-2.0, np.full(run.effects, size**-2.0))
     rows, K = white.rows.astype(float), len(prior)
     fit = np.linalg.solve(white.gram[:K, :K] + np.diag(prior), white.gram[:K, -1])
     rest = physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit)
-    out, first = dict[str, Series](), 0
+    out, first = [np.zeros(len(o.value)) for o in run.log.observed], 0
+    for i, _, mine in sample_map(run.log).blocks:
+        out[i][mine] = rest[first : first + len(mine)]
+        first += len(mine)
+    return out
+
+
+def _series(
+    run: RunResiduals, noise: Mapping[str, ResidualNoise], gains: SharedGains, rest: Sequence[Array]
+) -> dict[str, Series]:
+    """Residuals without the errors that channels share, in units of the data sheets' sigma, by channel and
+    window."""
+    own = without_shared(run.log, gains, [r[:, None] for r in rest])
+    out = dict[str, Series]()
     for i, _, mine in sample_map(run.log).blocks:
         observed = run.log.observed[i]
-        values = rest[first : first + len(mine)] / noise_sigma(observed, noise[observed.channel])[mine]
+        values = own[i][mine, 0] / noise_sigma(observed, noise[observed.channel])[mine]
         out.setdefault(observed.channel, []).append((observed.slot[mine], values))
-        first += len(mine)
     return out

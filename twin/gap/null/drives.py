@@ -81,7 +81,8 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
 
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     """Share of the commands, by time, that runs and references have in common, over that of as many of the
-    references with the rest, at most one; twists as for `coverage`."""
+    references with the rest, less two standard deviations of one of these; at most one. Twists as for
+    `coverage`."""
     size, known = min(len(runs), len(references) // 2), [by_cell(twist) for twist in references]
     if not size:
         return 1.0
@@ -89,7 +90,9 @@ def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
         _in_common(known[i : i + size], [*known[:i], *known[i + size :]])
         for i in range(0, len(known) - size + 1, size)
     ]
-    return min(_in_common([by_cell(twist) for twist in runs], known) / max(float(np.mean(own)), 1e-9), 1.0)
+    alone = [_in_common([one], [*known[:i], *known[i + 1 :]]) for i, one in enumerate(known)]
+    usual = float(np.mean(own)) * (1.0 - 2.0 * float(np.std(alone)) / max(float(np.mean(alone)), 1e-9))
+    return min(_in_common([by_cell(twist) for twist in runs], known) / max(usual, 1e-9), 1.0)
 
 
 def _in_common(runs: Sequence[Samples], others: Sequence[Samples]) -> float:

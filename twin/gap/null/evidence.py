@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import digest, prepared
@@ -27,6 +26,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.run_soil import at_run_soil
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 from terrafusion.twin.model.vehicle import VehicleParams
 
 
@@ -51,7 +51,7 @@ class GapEvidence:
     model: Model
     candidates: Candidates
     channels: tuple[str, ...]
-    noise: dict[str, ResidualNoise]
+    noise: ChannelNoise
     runs: list[WhitenedRun]
     references: list[WhitenedRun]
     reference_names: tuple[str, ...]

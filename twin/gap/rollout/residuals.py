@@ -31,6 +31,7 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     linearise,
     moved_to,
 )
+from terrafusion.twin.gap.rollout.shared_errors import gains_of, with_shared, without_shared
 from terrafusion.twin.model.vehicle import VehicleParams
 
 SOIL_SIGMAS = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
@@ -326,6 +327,7 @@ def noise_sigma(observed: Observed, noise: ResidualNoise) -> Array:
 def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, given one array a channel, in units and axes in which the noise is
     white."""
+    columns = without_shared(log, gains_of(noise), columns)
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
     sigma = [noise_sigma(o, noise[o.channel]) for o in log.observed]
     for i, rows, places in sample_map(log).equally_spaced:
@@ -345,7 +347,14 @@ def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: 
         out[places] = noise[observed.channel].unwhiten_alike(
             observed.slot[rows[0]], sigma[i][rows], error[places]
         )
-    return out
+    blocks = sample_map(run.log).blocks
+    parts = [np.zeros((len(o.value), 1)) for o in run.log.observed]
+    place = 0
+    for i, _, rows in blocks:
+        parts[i][rows, 0] = out[place : place + len(rows)]
+        place += len(rows)
+    whole = with_shared(run.log, gains_of(noise), parts)
+    return np.concatenate([whole[i][rows, 0] for i, _, rows in blocks])
 
 
 def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:

@@ -1,0 +1,1 @@
+"""The diagnosis judged by a robot in MuJoCo, which shares no code with the twin."""
