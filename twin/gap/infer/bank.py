@@ -152,7 +152,7 @@ def _near(a: float, b: float) -> bool:
 
 def model_soil(evidence: GapEvidence) -> list[Array]:
     """The model's own soil for each run: a run's own holds a part of the effect."""
-    return [np.zeros_like(run.residuals.soil) for run in evidence.runs]
+    return [np.zeros(len(evidence.soil_limit))] * len(evidence.runs)
 
 
 def is_simulated(law: Hypothesis, candidates: Candidates) -> bool:

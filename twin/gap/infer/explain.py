@@ -26,7 +26,6 @@ from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, me
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns
-from terrafusion.twin.gap.rollout.run_soil import soil_limit
 
 Sets = tuple[str, ...]  # names of effects that act together, sorted
 
@@ -119,8 +118,7 @@ class _Explainer:
     def with_best_sizes(self, look: _Look, sizes: Mapping[int, list[float]]) -> SignatureBank:
         """The bank simulated where no size is near the best ones, each run on the soil that fits it beside
         the law. Where the law is one of the soil itself, what the runs have in common belongs to the law."""
-        candidates = self.evidence.candidates
-        limit, soil = soil_limit(candidates), soil_columns(candidates)
+        limit, soil = self.evidence.soil_limit, soil_columns(self.evidence.candidates)
         _, _, used = look.laws.best(look.metric)
         points = list[SimulatedSize]()
         for i, some in sizes.items():

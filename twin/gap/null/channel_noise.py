@@ -27,7 +27,6 @@ from terrafusion.twin.gap.rollout.shared_errors import (
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
-ROUNDS = 2  # of learning, the first with the noise of the data sheets
 ANY_SIZE = 30.0  # 1 sigma of effects of any size, and of functions of the commands, in their units (assumed)
 LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet (assumed)
 
@@ -46,18 +45,22 @@ def learn_noise(
     judged: Sequence[RunResiduals],
     candidates: Candidates,
     jobs: int = 1,
+    before: ChannelNoise | None = None,
 ) -> ChannelNoise:
     """Scale and correlation in time of the noise, by channel, and of the errors that channels share.
 
     Theta, effects and poses are fitted to each reference run (ridge, one typical size) and the residuals are
     noise. Without references the judged runs are used, with effects of any size: or a large one would pass
     for noise.
+
+    Args:
+        before: noise learnt from nearly the same residuals; None: two rounds from that of the data sheets.
     """
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
-    noise = ChannelNoise(data_sheet_noise(every))
+    noise = before or ChannelNoise(data_sheet_noise(every))
     sigma, lags = initial_state_sigma(candidates), _lags(every)
-    for _ in range(ROUNDS):
+    for _ in range(1 if before else 2):
         now, series = noise, dict[str, Series]()
         rests = in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs)
         gains = learn_gains((run.log, rest) for run, rest in zip(runs, rests, strict=True))

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.start import Soils
@@ -24,7 +25,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     initial_state_sigma,
     whitened,
 )
-from terrafusion.twin.gap.rollout.run_soil import at_run_soil
+from terrafusion.twin.gap.rollout.run_soil import at_run_soil, soil_limit
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -41,6 +42,7 @@ class GapEvidence:
         noise: of each channel.
         runs, references: whitened residuals of each; references by their content, in whatever order given.
         reference_names: in the order given.
+        soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
         notes: assumptions, in sentences.
         patchier: how many times as much the ground of the judged runs varies along the path as that of the
@@ -55,6 +57,7 @@ class GapEvidence:
     runs: list[WhitenedRun]
     references: list[WhitenedRun]
     reference_names: tuple[str, ...]
+    soil_limit: Array
     cache: LinearisationCache
     notes: tuple[str, ...]
     patchier: float | None = None
@@ -94,8 +97,14 @@ def gather_evidence(
             progress(0.7 * next(done) / len(logs))
 
     residuals = all_residuals(logs, linearised, channels, jobs, count)
-    noise = learn_noise(residuals[R:], residuals[:R], candidates, jobs)
-    every = at_run_soil(residuals, linearised, noise, jobs)
+    first = learn_noise(residuals[R:], residuals[:R], candidates, jobs)
+    free = at_run_soil(residuals, linearised, first, jobs=jobs)
+    limit = soil_limit(free[R:], candidates)
+    # The same search for all, or a run that is but a further reference would differ from them.
+    beyond = [not (abs(run.soil) <= limit).all() for run in free]
+    limited = iter(at_run_soil([*itertools.compress(residuals, beyond)], linearised, first, limit, jobs))
+    every = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
+    noise = learn_noise(every[R:], every[:R], candidates, jobs, first)
     errors = in_threads(jobs, lambda run: whitened(run.errors_alone(), noise), every)
     usual = reference_loudness(errors[R:])
     every = [with_loud_noise(run, own, usual) for run, own in zip(every, errors, strict=True)]
@@ -107,6 +116,6 @@ def gather_evidence(
     clipped = limit_outliers(white[:R], white[R:], first_sigma, jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return GapEvidence(
-        model, candidates, channels, noise, *clipped, names, linearised,
+        model, candidates, channels, noise, *clipped, names, limit, linearised,
         tuple(dict.fromkeys(notes)), more, jobs,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, RunResiduals, run_residuals
-from terrafusion.twin.gap.rollout.run_soil import MOST_SOIL, SoilSearch, search_soil, with_run_soil
+from terrafusion.twin.gap.rollout.run_soil import SoilSearch, search_soil, with_run_soil
 
 RUNS = 3  # references that are used
 TOGETHER = (3.0, 1.0)
@@ -47,5 +47,5 @@ def set_soil(
     runs = all_residuals(logs[:RUNS], cache, channels, jobs)
     noise = learn_noise(runs, [], cache.candidates, jobs)
     search, model = SoilSearch.of(runs, noise, TOGETHER), cache.model
-    search_soil([search], cache, noise, MOST_SOIL, jobs)
+    search_soil([search], cache, noise, jobs=jobs)
     return dataclasses.replace(model, effects={**model.effects, **with_run_soil(search.soil, cache, {})[0]})

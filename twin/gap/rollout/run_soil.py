@@ -27,9 +27,10 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 
-MOST_SOIL, MOST_SIGMAS = 4.0, 2.0
-"""Limit of a soil that runs share, in typical sizes from the model's, and of one run's, in first 1 sigma
-(assumed): what goes beyond is a gap."""
+MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's (assumed)
+LIMIT_SIGMAS = 3.0
+"""A run's soil is also limited to so many sigmas of the references' soils (assumed): what goes beyond is a
+gap."""
 STEPS, ENOUGH, GOOD = 6, 0.97, 1.2
 """Most steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
 SHORTER, LEAST_STEP = 0.4, 0.1
@@ -107,10 +108,14 @@ def search_soil(
     searches: Sequence[SoilSearch],
     cache: LinearisationCache,
     noise: Mapping[str, ResidualNoise],
-    limit: Array | float,
+    limit: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> None:
-    """Take the searches to their ends; `limit` of the soil (S,), in typical sizes from the model's."""
+    """Take the searches to their ends.
+
+    Args:
+        limit: of the soil (S,), in typical sizes from the model's.
+    """
 
     def next_soil(search: SoilSearch) -> tuple[dict[str, float], Array]:
         soil = search.soil + search.step(cache.candidates)
@@ -131,11 +136,12 @@ def at_run_soil(
     runs: Sequence[RunResiduals],
     cache: LinearisationCache,
     noise: Mapping[str, ResidualNoise],
+    limit: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> list[RunResiduals]:
-    """Runs with errors linearised about their own soil."""
+    """Runs with errors linearised about their own soil; `limit` as for `search_soil`."""
     searches = in_threads(jobs, lambda run: SoilSearch.of([run], noise, ALONE), runs)
-    search_soil(searches, cache, noise, soil_limit(cache.candidates), jobs)
+    search_soil(searches, cache, noise, limit, jobs)
     return [
         dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.errors[0]))
         for run, s in zip(runs, searches, strict=True)
@@ -162,6 +168,9 @@ def with_run_soil(
     return out, applied
 
 
-def soil_limit(candidates: Candidates) -> Array:
-    """How far (S,) the soil of one run may lie from the model's, in typical sizes."""
-    return MOST_SIGMAS * np.array([s for name, s in SOIL_SIGMAS.items() if name in candidates.keys])
+def soil_limit(references: Sequence[RunResiduals], candidates: Candidates) -> Array:
+    """How far (S,) the soil of a run may lie from the model's, by the references; the first guess counts as
+    one of them."""
+    first = np.array([sigma for name, sigma in SOIL_SIGMAS.items() if name in candidates.keys])
+    squares = sum((run.soil**2 for run in references), first**2)
+    return np.minimum(LIMIT_SIGMAS * np.sqrt(squares / (1 + len(references))), MOST_SOIL)
