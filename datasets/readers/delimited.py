@@ -25,6 +25,8 @@ from terrafusion.datasets.core.decimals import NotADecimal, to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 
+BLOCK = 1 << 20
+NEWLINE = b"\n"
 BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
@@ -47,7 +49,7 @@ class TextLayout:
         comment: character that begins lines without a row; "" for none.
         time: column of seconds, for the times in errors; "" for none.
         strict: a log folder's rules: only an empty cell is a missing value, blanks belong to the cell,
-            a last line that was cut off is an error, times count from 0 instead of the first row.
+            times count from 0 instead of the first row.
     """
 
     names: tuple[str, ...]
@@ -114,21 +116,37 @@ class TextTable(Columns):
         return _line_error(self.data, self.layout, what, cells, remedy)
 
 
+class CutText(bytes):
+    """Text of a file that is cut off inside its last line."""
+
+
 def read_text(path: Path) -> bytes:
     """The bytes of a text file, unpacked where it is a .gz, without a byte order mark.
+
+    Of a .gz that ends too early, and of a file with zeros for its end (as after a loss of power), it is the
+    `CutText` that is there.
 
     Raises:
         DataError: unreadable, empty, over 512 MB, or no UTF-8 text.
     """
+    cut = False
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             packed = os.fstat(file.fileno()).st_size
-            data = file.read(min(limits.FREE_BYTES + limits.EXPANSION * packed, limits.TEXT_BYTES) + 1)
-    except (OSError, EOFError, zlib.error) as error:
+            most = min(limits.FREE_BYTES + limits.EXPANSION * packed, limits.TEXT_BYTES) + 1
+            read = bytearray()
+            try:
+                while len(read) < most and (block := file.read1(BLOCK)):
+                    read += block
+            except EOFError:
+                cut = True
+    except (OSError, zlib.error) as error:
         what = f"cannot be read: {getattr(error, 'strerror', '') or error}"
         raise DataError(what, remedy="is it complete?") from None
+    data = bytes(read).removeprefix(BOM)
     _check_size(data, packed)
-    data = data.removeprefix(BOM)
+    if data.endswith(b"\0"):
+        cut, data = True, data.rstrip(b"\0")
     if not data or data.isspace():
         raise DataError("the file is empty", remedy="copy it again; a table has at least a header")
     try:
@@ -137,7 +155,7 @@ def read_text(path: Path) -> bytes:
         raise DataError(f"not UTF-8 at byte {error.start}", remedy="save it as UTF-8") from None
     if b"\0" in data:
         raise DataError("holds zero bytes: not a text file", remedy="copy it again")
-    return data
+    return CutText(data) if cut else data
 
 
 def _check_size(data: bytes, packed: int) -> None:
@@ -195,19 +213,20 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def read_columns(
-    path: Path, data: bytes, layout: TextLayout, numbers: Sequence[str], texts: Sequence[str] = ()
+    path: Path, text: bytes, layout: TextLayout, numbers: Sequence[str], texts: Sequence[str] = ()
 ) -> TextTable:
     """Parse the columns that are asked for; a last line that was cut off is left out with a note.
 
     Args:
+        text: of the file, by `read_text`.
         layout: how its rows are written.
         numbers: columns of numbers; empty and NaN cells are missing values.
 
     Raises:
         DataError: no rows, a line with too few or too many cells, a cell that is no finite number.
     """
-    end, notes = _complete_end(path, data, layout)
-    data = data[:end]
+    end, notes = _complete_end(path, text, layout)
+    data = text[:end]
     limits.check_columns(len(layout.names))
     if data.count(b"\n") * (len(numbers) + len(texts)) > limits.VALUES:
         raise limits.too_much("values", limits.VALUES)
@@ -224,6 +243,8 @@ def read_columns(
         numbers={n: table[n] for n in numbers},
         texts={n: table[n] for n in texts},
     )
+    if not len(columns) and isinstance(text, CutText):
+        raise DataError("cannot be read: it is cut off before its first row", remedy="is it complete?")
     if not len(columns) and not layout.strict:
         what = "holds a header but no rows" if layout.first_line > 1 else "holds no rows"
         raise DataError(what, remedy="record or copy it again")
@@ -232,15 +253,32 @@ def read_columns(
 
 def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tuple[str, ...]]:
     """Where complete lines end, and what to note of the last one."""
-    if data.endswith((b"\n", b"\r")):
+    cut = isinstance(data, CutText)
+    if data.endswith((b"\n", b"\r")) and not cut:
         return len(data), ()
     begin = data.rfind(b"\n") + 1
     last = data[begin : begin + limits.LINE_BYTES].decode("utf-8", "replace")
     long = len(data) - begin > limits.LINE_BYTES
     first = data.count(b"\n", 0, begin) + 1 < layout.first_line
-    if not (long or first or layout.strict) and len(split(last, layout.separator)) < len(layout.names):
-        return begin, (f"{path.name}: the last line was cut off and is left out",)
+    whole = long or first or len(split(last, layout.separator)) >= len(layout.names)
+    if cut or not whole:
+        return begin, (f"{path.name}: the last line was cut off and is left out{_end(data[:begin], layout)}",)
     return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
+
+
+def _end(data: bytes, layout: TextLayout) -> str:
+    """At which line and time complete lines end, for a note."""
+    text = data[-limits.LINE_BYTES :].rstrip().rpartition(b"\n")[2].decode("utf-8", "replace")
+    at = f"; its data end in line {data.count(NEWLINE)}"
+    time_s, origin_s = layout.seconds(split(text, layout.separator)), _origin_s(data, layout)
+    return at if time_s is None or origin_s is None else f"{at}, t = {time_s - origin_s:.3f} s"
+
+
+def _origin_s(data: bytes, layout: TextLayout) -> float | None:
+    """The time from which times count; None where it cannot be read."""
+    if layout.strict:
+        return 0.0
+    return layout.seconds(next(_rows(data, layout), (0, []))[1] if layout.time else [])
 
 
 def _check_counts(data: bytes, layout: TextLayout) -> None:
@@ -260,9 +298,7 @@ def _check_counts(data: bytes, layout: TextLayout) -> None:
 
 def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
-    first = [] if layout.strict or not layout.time else next(_rows(data, layout), (0, []))[1]
-    time_s = layout.seconds(cells)
-    origin_s = 0.0 if layout.strict else layout.seconds(first)
+    time_s, origin_s = layout.seconds(cells), _origin_s(data, layout)
     since_s = None if time_s is None or origin_s is None else time_s - origin_s
     return DataError(what, time_s=since_s, remedy=remedy)
 

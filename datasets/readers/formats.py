@@ -85,9 +85,9 @@ class Format:
 _READERS = "terrafusion.datasets.readers"
 FORMATS: tuple[Format, ...] = (
     Format("comma_segment", "a segment of comma2k19 (its folder)", f"{_READERS}.sets.comma_segment"),
-    Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
     Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros.ros1"),
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros.ros2"),
+    Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
     Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.sets.umich_text"),
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.sets.norlab_pickle"),
     Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.sets.pathfinder_mat"),

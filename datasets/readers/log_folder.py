@@ -27,8 +27,8 @@ CHANNELS = (*Recording.CHANNELS, "truth")
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether `path` is a log folder: any folder that is not a ROS 2 bag."""
-    return path.is_dir() and ((path / META).is_file() or not (path / "metadata.yaml").is_file())
+    """Whether `path` is a log folder: any folder, once those of other formats are claimed."""
+    return path.is_dir()
 
 
 def read(request: Request) -> list[Recording]:

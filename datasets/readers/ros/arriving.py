@@ -82,6 +82,8 @@ def _decoded(decoder: MessageDecoder, messages: Sequence[RawMessage]) -> Stream:
 class GatheredMessages:
     """The newest messages of some topics, as an open bag."""
 
+    cut = ""
+
     def __init__(self) -> None:
         self.messages: deque[RawMessage] = deque(maxlen=MOST_GATHERED)
 

@@ -102,7 +102,11 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
         DataError, BagError: no usable topic, or what the channels refuse.
     """
     with errors_of(request.path):
-        return _recording(container, request)
+        recording = _recording(container, request)
+    if not container.cut:
+        return recording
+    end = f"its data end at t = {recording.duration_s():.3f} s"
+    return recording.with_notes(f"{request.path.name} is cut off ({container.cut}): {end}")
 
 
 def _recording(container: BagContainer, request: Request) -> Recording:

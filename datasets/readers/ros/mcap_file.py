@@ -1,13 +1,15 @@
 """The container MCAP, with chunks or without, indexed or not.
 
-The `mcap` library reads the summary, and goes over the records of a file without an index of chunks. Message
-records in a chunk, whose library reader takes one at a time, are found by one walk over their lengths.
+The `mcap` library reads the summary, and goes over the records of a file without an index of chunks, also of
+one that is cut off, up to its last complete record. Message records in a chunk, whose library reader takes
+one at a time, are found by one walk over their lengths.
 """
 
 import struct
 import zlib
 from collections.abc import Iterator
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -40,20 +42,23 @@ class McapFile:
     """An open MCAP file.
 
     Raises:
-        BagError: the file is cut off, was not closed by its recorder, or breaks the format.
+        BagError: the file breaks the format, or is cut off before its first message.
     """
 
     def __init__(self, path: Path) -> None:
         self._file, self._end = path.open("rb"), path.stat().st_size
+        self._complete: int | None = None  # records that can be read, of a file that is cut off
         try:
-            self._refuse_cut()
+            self.cut = "" if self._has_footer() else "it has no footer"
             reader = SeekingReader(self._file, record_size_limit=limits.CHUNK_BYTES)
-            summary = reader.get_summary() or Summary()
+            summary = (None if self.cut else reader.get_summary()) or Summary()
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunks = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
             counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
             self._counts = counts if self._is_known(counts) else self._counted()
             self.sources = [self._source(number) for number in sorted(self._channels)]
+            if self.cut and not any(source.count for source in self.sources):
+                raise BagError(f"{self.cut}, and no message is there")
         except BaseException:
             self.close()
             raise
@@ -61,13 +66,13 @@ class McapFile:
     def close(self) -> None:
         self._file.close()
 
-    def _refuse_cut(self) -> None:
+    def _has_footer(self) -> bool:
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise BagError("it does not begin as MCAP")
-        self._file.seek(max(self._end - len(MCAP0_MAGIC), 0))
-        if self._file.read() != MCAP0_MAGIC:
-            raise BagError("the file breaks off: it has no footer")
+        self._file.seek(max(self._end - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
+        footer = self._file.read()
         self._file.seek(0)
+        return footer == MCAP0_MAGIC
 
     def _is_known(self, counts: dict[int, int]) -> bool:
         """Whether the summary has the channels of these messages and, where they have one, their schemas."""
@@ -77,10 +82,16 @@ class McapFile:
     def _counted(self) -> dict[int, int]:
         """Learn channels and the numbers of their messages from the records themselves."""
         self._chunks = []
-        for record in self._records():
-            self._learn(record)
-            for inner in _inside(record) if isinstance(record, Chunk) else ():
-                self._learn(inner)
+        complete = 0
+        try:
+            for record in self._records():
+                for inner in _inside(record) if isinstance(record, Chunk) else (record,):
+                    self._learn(inner)
+                complete += 1
+        except Exception:  # the library has many for a record that breaks off
+            if not self.cut:
+                raise
+            self._complete = complete
         channels = sorted(self._channels)
         counts = dict.fromkeys(channels, 0)
         for batch in self.batches([[number] for number in channels]):
@@ -120,9 +131,10 @@ class McapFile:
             yield from raw.batches_of(loose, wanted)
 
     def _records(self) -> Iterator[McapRecord]:
-        """All records of the file, chunks as they are."""
+        """All records of the file that can be read, chunks as they are."""
         self._file.seek(0)
-        return StreamReader(self._file, emit_chunks=True, record_size_limit=limits.CHUNK_BYTES).records
+        reader = StreamReader(self._file, emit_chunks=True, record_size_limit=limits.CHUNK_BYTES)
+        return islice(reader.records, self._complete)
 
     def _indexed(self, wanted: Groups) -> Iterator[Chunk]:
         """The chunks that may hold messages of these channels."""

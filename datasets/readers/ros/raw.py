@@ -81,6 +81,11 @@ class BagContainer(Protocol):
     """An open bag file."""
 
     @property
+    def cut(self) -> str:
+        """In which way the file is cut off, "" where it is whole; what is there can be read."""
+        ...
+
+    @property
     def sources(self) -> list[BagSource]:
         """Who sent its messages."""
         ...

@@ -6,7 +6,7 @@ which takes 5 times as long.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,9 +27,10 @@ from terrafusion.datasets.readers.ros.raw import (
     normal_type,
     numbers_at,
 )
+from terrafusion.datasets.readers.ros.streams import broken_bag_on_error
 
 MAGIC = b"#ROSBAG V2.0\n"
-BAG, INDEX, CHUNK, CONNECTION = 3, 4, 5, 7
+MESSAGE, BAG, INDEX, CHUNK, CONNECTION = 2, 3, 4, 5, 7
 MIN_HEADER_BYTES, MAX_HEADER_BYTES = 25, 1 << 20
 """Of a record: the fields op and conn, and one more."""
 PLACE = np.dtype([("sec", "<u4"), ("nanosec", "<u4"), ("at", "<u4")])
@@ -62,11 +63,11 @@ class Ros1File:
     """An open ROS 1 bag.
 
     Raises:
-        BagError: the file is cut off, was not closed by its recorder, or breaks the format.
+        BagError: the file breaks the format, or is cut off before its first message.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file, self._end = path.open("rb"), path.stat().st_size
+        self._file, self._end, self.cut = path.open("rb"), path.stat().st_size, ""
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
         try:
@@ -80,51 +81,108 @@ class Ros1File:
         self._file.close()
 
     def _walk(self) -> None:
-        """Go over all records of the file, without reading the chunks."""
+        """Go over all records of the file; the chunks are read where it is cut off, else only their index."""
+        header, position = self._header()
+        index_at = _number(header, "index_pos")
+        if not index_at:
+            self.cut = "its recorder did not close it"
+        elif index_at > self._end:
+            self.cut = f"{self._end} of more than {index_at} bytes are there"
+        try:
+            while position < self._end:
+                position = self._take(position)
+            promised = _number(header, "conn_count"), _number(header, "chunk_count")
+            if not self.cut and (len(self._connections), len(self._chunks)) != promised:
+                raise BagError(f"the bag ends after {len(self._chunks)} of {promised[1]} chunks")
+        except BagError as error:
+            if not self.cut and position < index_at:
+                raise
+            self.cut = self.cut or str(error)
+        if self.cut:
+            self._index_chunks()
+
+    def _header(self) -> tuple[dict[str, bytes], int]:
+        """Fields of the bag's header, and where the record behind it begins."""
         if self._file.read(len(MAGIC)) != MAGIC:
             raise BagError("it does not begin as a ROS 1 bag, version 2.0")
-        position, promised = len(MAGIC), None
-        while position < self._end:
-            fields, start, size = self._record(position)
-            kind = _number(fields, "op")
-            if position == len(MAGIC):
-                promised = self._promised(kind, fields)
-            elif kind == CHUNK:
-                compression = fields.get("compression", b"").decode()
-                self._chunks.append(_Chunk(start, size, compression, _number(fields, "size"), {}))
-            elif kind == INDEX and self._chunks:
-                known, number = self._chunks[-1].places, _number(fields, "conn")
-                if _number(fields, "count") * PLACE.itemsize != size:
-                    raise BagError(f"an index has {size} bytes for {_number(fields, 'count')} messages")
-                places = np.frombuffer(self._read(start, size), PLACE)
-                known[number] = np.concatenate([known[number], places]) if number in known else places
-            elif kind == CONNECTION:
-                self._connections[_number(fields, "conn")] = fields, _fields(self._read(start, size))
-            position = start + size
-        if promised is None or (len(self._connections), len(self._chunks)) != promised:
-            whole = f" of {promised[1]}" if promised else ""
-            raise BagError(f"the bag ends after {len(self._chunks)}{whole} chunks")
-
-    def _promised(self, kind: int, fields: dict[str, bytes]) -> tuple[int, int]:
-        """Numbers of connections and chunks, by the bag's header."""
-        if kind != BAG:
+        fields, start, size = _record(self._read, len(MAGIC))
+        if _number(fields, "op") != BAG:
             raise BagError("the first record is not the bag's header")
         if fields.get("encryptor"):
             raise BagError("the bag is encrypted")
-        if not _number(fields, "index_pos"):
-            raise BagError("the bag has no index: its recorder did not close it")
-        return _number(fields, "conn_count"), _number(fields, "chunk_count")
+        return fields, start + size
 
-    def _record(self, position: int) -> tuple[dict[str, bytes], int, int]:
-        """Header fields of a record, and where its data begin and how long they are."""
-        (size,) = _length(self._read(position, 4))
-        if size > MAX_HEADER_BYTES:
-            raise BagError(f"a record's header claims {size} bytes")
-        header = self._read(position + 4, size + 4)
-        start, data = position + 8 + size, int(_length(header, size)[0])
-        if start + data > self._end:
-            raise BagError(f"the file ends at {self._end} of {start + data} bytes")
-        return _fields(header[:size]), start, data
+    def _take(self, position: int) -> int:
+        """Keep what a record says; returns where the next one begins."""
+        fields, start, size = _record(self._read, position)
+        kind, end = _number(fields, "op"), start + size
+        if kind == CHUNK:
+            compression, unpacked = fields.get("compression", b"").decode(), _number(fields, "size")
+            if self.cut and compression == "none" and (not size or end > self._end):
+                # its size is written when the chunk is full
+                size = unpacked = self._end - start
+                end = self._end
+            self._chunks.append(_Chunk(start, size, compression, unpacked, {}))
+        if end > self._end:
+            raise BagError(f"the file ends at {self._end} of {end} bytes")
+        if kind == INDEX and self._chunks:
+            known, number = self._chunks[-1].places, _number(fields, "conn")
+            if _number(fields, "count") * PLACE.itemsize != size:
+                raise BagError(f"an index has {size} bytes for {_number(fields, 'count')} messages")
+            places = np.frombuffer(self._read(start, size), PLACE)
+            known[number] = np.concatenate([known[number], places]) if number in known else places
+        elif kind == CONNECTION:
+            self._connections[_number(fields, "conn")] = fields, _fields(self._read(start, size))
+        return end
+
+    def _index_chunks(self) -> None:
+        """Find the messages of each chunk in its own records; what is broken ends the bag."""
+        chunks, self._chunks, unpacked, count = self._chunks, [], 0, 0
+        for chunk in chunks:
+            try:
+                with broken_bag_on_error():
+                    data = self._unpacked(chunk)
+            except BagError:
+                break
+            unpacked += len(data)
+            limits.check_expansion(unpacked, self._end)
+            places = self._places(data)
+            count += sum(map(len, places.values()))
+            if count > limits.ROWS:
+                raise limits.too_much("messages", limits.ROWS)
+            self._chunks.append(chunk._replace(places=places))
+        if not count:
+            raise BagError(f"{self.cut}, and no message is there")
+
+    def _places(self, data: bytes) -> dict[int, NDArray[Any]]:
+        """Places of the complete messages of a chunk, by connection; its connections become known."""
+
+        def read(position: int, size: int) -> bytes:
+            if position + size > len(data):
+                raise BagError("a record reaches past its chunk")
+            return data[position : position + size]
+
+        found: dict[int, list[tuple[int, int, int]]] = {}
+        position = 0
+        while position < len(data):
+            try:
+                fields, start, size = _record(read, position)
+                content = read(start, size)
+                kind = _number(fields, "op")
+                if kind == CONNECTION:
+                    self._connections[_number(fields, "conn")] = fields, _fields(content)
+                elif kind == MESSAGE:
+                    nanosec, sec = divmod(_number(fields, "time"), 1 << 32)
+                    found.setdefault(_number(fields, "conn"), []).append((sec, nanosec, position))
+            except BagError:
+                break
+            position = start + size
+        return {number: np.array(places, dtype=PLACE) for number, places in found.items()}
+
+    def _unpacked(self, chunk: _Chunk) -> bytes:
+        if chunk.size > limits.CHUNK_BYTES:
+            raise BagError(f"a chunk claims {chunk.size} bytes")
+        return decompress(self._read(chunk.start, chunk.size), chunk.compression, chunk.unpacked)
 
     def _read(self, position: int, size: int) -> bytes:
         if position + size > self._end:
@@ -150,9 +208,7 @@ class Ros1File:
         for chunk in self._chunks:
             if all(chunk.places.keys().isdisjoint(ids) for ids in wanted):
                 continue
-            if chunk.size > limits.CHUNK_BYTES:
-                raise BagError(f"a chunk claims {chunk.size} bytes")
-            data = decompress(self._read(chunk.start, chunk.size), chunk.compression, chunk.unpacked)
+            data = self._unpacked(chunk)
             unpacked += len(data)
             limits.check_expansion(unpacked, self._end)
             for group, ids in enumerate(wanted):
@@ -173,6 +229,15 @@ def _batch(group: int, data: Bytes, places: NDArray[Any]) -> MessageBatch:
         raise BagError("the messages of a chunk are larger than the chunk")
     receipt_ns = places["sec"].astype(np.int64) * 1_000_000_000 + places["nanosec"]
     return MessageBatch(group, data, at + 8 + headers, sizes, receipt_ns)
+
+
+def _record(read: Callable[[int, int], bytes], position: int) -> tuple[dict[str, bytes], int, int]:
+    """Header fields of a record, and where its data begin and how long they are."""
+    (size,) = _length(read(position, 4))
+    if size > MAX_HEADER_BYTES:
+        raise BagError(f"a record's header claims {size} bytes")
+    header = read(position + 4, size + 4)
+    return _fields(header[:size]), position + 8 + size, int(_length(header, size)[0])
 
 
 def _fields(header: bytes) -> dict[str, bytes]:

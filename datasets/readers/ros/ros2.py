@@ -1,9 +1,17 @@
-"""ROS 2 bags: a folder with `metadata.yaml` and the files that it names, or one `.mcap` or `.db3` file."""
+"""ROS 2 bags: a folder with `metadata.yaml` and the files that it names, or one `.mcap` or `.db3` file.
 
+A recorder that was killed writes no `metadata.yaml`: its files are named after the folder, and numbered.
+"""
+
+import contextlib
 import dataclasses
+import os
+import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -40,25 +48,34 @@ USED = {"topics", "messages", "message_definitions"}
 class Db3File:
     """An open SQLite database of a ROS 2 bag.
 
+    Of one that is cut off, a copy of its whole pages is read, up to the first that is missing. The file of
+    changes that a killed recorder leaves beside it is applied to the copy.
+
     Raises:
-        BagError: the file is cut off, or not such a database.
+        BagError: it is not such a database, or cut off before its first message.
     """
 
     def __init__(self, path: Path) -> None:
-        _refuse_cut(path)
-        self._bytes, self._steps = path.stat().st_size, 0
-        uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-        self._database = sqlite3.connect(uri, uri=True)
-        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MESSAGE_BYTES)
-        self._database.set_progress_handler(self._is_endless, STEPS_AT_A_TIME)
+        self._scratch = ExitStack()
         try:
+            page, self.cut = _page_and_cut(path)
+            if self.cut:
+                path = _copied(path, self._scratch.enter_context(scratch_folder()), page)
+            self._bytes, self._steps = path.stat().st_size, 0
+            uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+            self._database = sqlite3.connect(uri, uri=True)
+            self._scratch.callback(self._database.close)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MESSAGE_BYTES)
+            self._database.set_progress_handler(self._is_endless, STEPS_AT_A_TIME)
+            if self.cut:
+                self._database.execute("PRAGMA writable_schema = ON")  # else SQLite refuses missing pages
             self.sources: list[BagSource] = self._sources()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        self._database.close()
+        self._scratch.close()
 
     def _is_endless(self) -> bool:
         """Whether a question needs more steps than a file of this size can need."""
@@ -68,6 +85,16 @@ class Db3File:
     def _run(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
         self._steps = 0
         return self._database.execute(query, values)
+
+    def _rows(self, query: str, values: Sequence[Any] = ()) -> Iterator[Any]:
+        """The rows of an answer, of a database that is cut off those before the cut."""
+        try:
+            yield from self._run(query, values)
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError:
+            if not self.cut:
+                raise
 
     def _check_tables(self) -> set[str]:
         """Names of the tables, which must be plain: a computed column or a view can hold any amount."""
@@ -82,7 +109,9 @@ class Db3File:
         run, tables = self._run, self._check_tables()
         if not {"topics", "messages"} <= tables:
             raise BagError("the database has no tables of topics and messages")
-        counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+        counts = Counter(number for (number,) in self._rows("SELECT topic_id FROM messages ORDER BY id"))
+        if self.cut and not counts:
+            raise BagError(f"{self.cut}, and no message is there")
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -105,28 +134,50 @@ class Db3File:
         marks = ", ".join("?" * len(topics))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
         unpacked = 0
-        rows = self._run(query, topics)
-        while block := rows.fetchmany(FETCHED_ROWS):
+        rows = self._rows(query, topics)
+        while block := list(islice(rows, FETCHED_ROWS)):
             unpacked += sum(len(blob) for *_, blob in block)
             limits.check_expansion(unpacked, self._bytes)
             yield from batches_of(block, wanted)
 
 
-def _refuse_cut(path: Path) -> None:
-    """SQLite reads a file that lost its tail without a word: compare its size with its header.
+def _changes(path: Path) -> list[Path]:
+    """Files in which SQLite has changes that are not in the database yet, or to be undone."""
+    beside = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
+    return [file for file in beside if file.is_file() and file.stat().st_size]
 
-    Page size at byte 16 (1 means 65536) and page count at byte 28, which holds when the counters
-    at bytes 24 and 92 agree: SQLite file format, sec. 1.3.
+
+def _copied(path: Path, folder: Path, page: int) -> Path:
+    """A copy of a database without a last page that is not whole, with the changes beside it applied."""
+    target = folder / path.name
+    for file in (path, *_changes(path)):
+        shutil.copyfile(file, folder / file.name)
+    os.truncate(target, target.stat().st_size // page * page)
+    with closing(sqlite3.connect(target)) as database, contextlib.suppress(sqlite3.DatabaseError):
+        database.execute("PRAGMA journal_mode = DELETE")  # applies them; refused where pages are missing
+    return target
+
+
+def _page_and_cut(path: Path) -> tuple[int, str]:
+    """Bytes of a page, and in which way the database is cut off; "" of a whole one.
+
+    SQLite reads a file that lost its tail without an error: its size is compared with its header. Page size
+    at byte 16 (1 means 65536) and page count at byte 28, which holds when the counters at bytes 24 and 92
+    agree: SQLite file format, sec. 1.3.
     """
     with path.open("rb") as file:
         header = file.read(100)
     size = path.stat().st_size
     page = int.from_bytes(header[16:18], "big")
-    wanted = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    page = 65536 if page == 1 else max(page, 512)
+    wanted = page * int.from_bytes(header[28:32], "big")
     if len(header) < 100 or (header[24:28] == header[92:96] and size < wanted):
-        raise BagError(f"the database is cut off: {size} of {wanted} bytes")
+        return page, f"{size} of {wanted} bytes are there"
+    return page, "its recorder did not close it" if _changes(path) else ""
 
 
+METADATA = "metadata.yaml"
+SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
 STORAGES: dict[str, type[McapFile] | type[Db3File]] = {"mcap": McapFile, "sqlite3": Db3File}
 
 
@@ -134,8 +185,10 @@ REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether `path` is a ROS 2 bag: a folder with `metadata.yaml`, or a file named `.mcap` or `.db3`."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in (".mcap", ".db3")
+    """Whether `path` is a ROS 2 bag: a folder of one, or a file named `.mcap` or `.db3`."""
+    if not path.is_dir():
+        return path.suffix in (".mcap", ".db3")
+    return not (path / "meta.yaml").is_file() and ((path / METADATA).is_file() or bool(_numbered(path)))
 
 
 def read(request: Request) -> list[Recording]:
@@ -166,7 +219,8 @@ class Ros2Folder:
         self._files: list[tuple[BagContainer, dict[int, int]]] = []  # and the ids here by those of the file
         self._scratch = ExitStack()
         self.sources: list[BagSource] = []
-        metadata = _metadata(folder / "metadata.yaml")
+        self.cut = "" if (folder / METADATA).is_file() else "its recorder did not close it"
+        metadata = _metadata(folder)
         storage = STORAGES.get(str(metadata.get("storage_identifier")))
         names = metadata.get("relative_file_paths")
         if storage is None or not isinstance(names, list) or not names:
@@ -197,6 +251,7 @@ class Ros2Folder:
         ids = {source.id: len(self.sources) + k for k, source in enumerate(file.sources)}
         self.sources += [dataclasses.replace(source, id=ids[source.id]) for source in file.sources]
         self._files.append((file, ids))
+        self.cut = file.cut or self.cut
 
     def _unpacked(self, path: Path) -> Path:
         """A file without its zstd compression, in a scratch folder."""
@@ -234,7 +289,19 @@ def _messages(batch: MessageBatch) -> Iterator[bytes]:
         yield decompress(packed, "zstd", whole)
 
 
-def _metadata(path: Path) -> dict[str, Any]:
+def _numbered(folder: Path) -> list[str]:
+    """Names of the bag files of a recorder, in order."""
+    name = folder.resolve().name
+    files = (path for path in folder.iterdir() if path.suffix in SUFFIXES and path.is_file())
+    numbers = {path.name: path.stem.removeprefix(f"{name}_") for path in files}
+    return sorted((n for n in numbers if numbers[n].isdecimal()), key=lambda n: int(numbers[n]))
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    path = folder / METADATA
+    if not path.is_file():
+        names = _numbered(folder)
+        return {"storage_identifier": SUFFIXES[Path(names[0]).suffix], "relative_file_paths": names}
     try:
         content = read_yaml(path, limits.METADATA_BYTES)
     except ConfigError as error:

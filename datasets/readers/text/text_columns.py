@@ -13,6 +13,7 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
+    CutText,
     TextLayout,
     head_lines,
     read_columns,
@@ -41,7 +42,9 @@ class TextColumns:
         self._data = read_text(path)
         self._layout = _layout(self._data, column_map)
         self.names = list(self._layout.names)
+        cut = isinstance(self._data, CutText)
         self._data, self._commas = _with_points(self._data, self._layout)
+        self._data = CutText(self._data) if cut else self._data
         self.notes: tuple[str, ...] = ()
 
     def read(self, names: list[str]) -> None:
