@@ -131,30 +131,30 @@ def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
     steered = steering is not None and bool(np.isfinite(steering.angle_rad).all(axis=1).any())
     of_wheel = steered and steering is not None and steering.names == ("steering_wheel",)
     sides = wheels is None or wheels.has_sides()
-    imu = "gyro_z" if _is_slow(recording.imu) else imu_kind(recording.imu)
-    return SensorConfig(imu, sides, fixes, steered, of_wheel)
+    return SensorConfig(imu_kind(recording.imu), sides, fixes, steered, of_wheel)
 
 
 def complete_samples(imu: Imu, kind: str) -> np.ndarray:
     """Which samples (N,) of the IMU have all values that its kind needs."""
-    z = np.isfinite(imu.gyro_radps[:, 2])
     if kind == "six_axis":
         return np.asarray(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))
-    return np.asarray(z)
+    return np.asarray(np.isfinite(imu.gyro_radps[:, 2]))
 
 
 def imu_kind(imu: Imu | None) -> str:
-    """Which of `IMU_KINDS` the IMU of a log is."""
+    """Which of `IMU_KINDS` the IMU of a log is; a slow one has no accelerations that could be used."""
     if imu is None or not complete_samples(imu, "gyro_z").any():
         return "none"
+    return "six_axis" if _has_six_axes(imu) and not _is_slow(imu) else "gyro_z"
+
+
+def _has_six_axes(imu: Imu) -> bool:
     six, z = int(complete_samples(imu, "six_axis").sum()), int(complete_samples(imu, "gyro_z").sum())
-    return "six_axis" if six >= COMPLETE_SHARE * z else "gyro_z"
+    return six >= COMPLETE_SHARE * z
 
 
-def _is_slow(imu: Imu | None) -> bool:
-    """Whether a six-axis IMU has too few samples to integrate its accelerations."""
-    if imu is None or imu_kind(imu) != "six_axis":
-        return False
+def _is_slow(imu: Imu) -> bool:
+    """Whether there are too few samples with six axes to integrate their accelerations."""
     t_ns = imu.t_ns[complete_samples(imu, "six_axis")]
     return len(t_ns) > 1 and float(np.median(np.diff(t_ns))) > 1e9 / LEAST_ACCEL_HZ
 
@@ -176,7 +176,7 @@ def _missing(imu: Imu | None) -> str:
             for axis, absent in zip("xyz", absent_accel.tolist(), strict=True)
             if absent
         ]
-    if _is_slow(imu):
+    if _has_six_axes(imu) and _is_slow(imu):
         return f"the accelerometer has fewer than {LEAST_ACCEL_HZ:g} samples a second, too few to integrate"
     if names:
         return f"the log has no {', no '.join(names)}"

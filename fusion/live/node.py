@@ -253,14 +253,15 @@ class LiveNode:
                 self._report(f"waiting: {sensors}")
                 self._gathered.forget(messages[-1].receipt_ns - MISSING_NS if messages else 0)
                 return
-            self.estimator = self._new_estimator(sensors)
+            self.estimator = estimator = self._new_estimator(sensors)
         except (TerrafusionError, BagError) as error:
             self._report(f"waiting: {error}")
             self._gathered.forget(messages[-1].receipt_ns if messages else 0)
             return
         self._sensors = sensors
         self._problem = ""
-        for line in sensors.notes:
+        config = estimator.config
+        for line in (*sensors.notes, *config.inputs.notes(sensors.recording, config.rig)):
             self._say(line)
         self._gathered.messages.clear()
         self._topics = {message.topic for message in messages}

@@ -94,6 +94,8 @@ def find_sensors(
         recording = recording_of(_usable(gathered, ArrivingMessages(request, dict(chosen))), repairing)
         if recording.imu is None or recording.wheels is None:
             raise
+    if recording.imu is not None and len(recording.imu) < 2:
+        return f"one message of {chosen['imu'].name} yet; the next one shows how fast it is"
     overrides = with_mountings(recording.overrides, mounted, request.rig)
     recording = dataclasses.replace(recording, overrides=overrides)
     arriving = ArrivingMessages(request, chosen, datum or recording.datum, _if_turned(turn))

@@ -175,6 +175,17 @@ def test_slip_and_ground_come_with_each_keyframe(run: Run) -> None:
     )
 
 
+@pytest.mark.parametrize(("every", "kind"), [(100, "gyro_z"), (10, "gyro_z"), (4, "six_axis")])
+def test_a_slow_imu_gets_the_graph_of_replay(messages: list[BagMessage], every: int, kind: str) -> None:
+    """Of 100 Hz every so many: accelerations that are too slow to integrate are not, and that is said."""
+    imu = [one for one in messages if one[1] == "/imu/data"]
+    left_out = {id(one) for i, one in enumerate(imu) if i % every}
+    run = Run().feed(one for one in messages if id(one) not in left_out)
+    assert run.node.estimator is not None
+    assert run.node.estimator.config.inputs.imu == kind
+    assert any("too few to integrate: a planar graph" in line for line in run.said) is (kind == "gyro_z")
+
+
 def broken(messages: list[BagMessage]) -> Iterable[BagMessage]:
     """The messages, and beside them what a bad day of a robot sends."""
     nan = np.full(3, np.nan).tobytes()
