@@ -45,10 +45,10 @@ from terrafusion.fusion.estimator.stationarity import StationarityDetector
 from terrafusion.fusion.estimator.steering import policy_of, steered_turn
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
-from terrafusion.fusion.graph import slow_states
+from terrafusion.fusion.graph import imu_gap, slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, pause, wheel_increment
+from terrafusion.fusion.graph.factors import imu_factor, mean_rates, pause, wheel_increment
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import (
     level_factor,
@@ -312,22 +312,23 @@ class Estimator:
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = with_centripetal_force(segments, before)
+        gap, turn = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns), None
+        if gap and self.config.inputs.sides and self._turn is None:
+            stretch = self.wheels.travelled(before_ns, t_ns), self.config.rig.track_m, dt
+            turn, segments = imu_gap.turn_in_gap(before, *stretch, segments)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         noise = self.learned.with_doubt(noise, t_ns, segments)
         if self.config.inputs.planar and wheels is not None:
-            gained_mps = before.rolling * wheels.speed_change_mps
-            segments = with_wheel_acceleration(segments, gained_mps / dt)
+            segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt)
         if self._skid.friction is not None:
             link_inputs = t_ns, dt, segments, wheels, before, self._covariance, self._skid.rate_m2ps
             segments, wheels = self._skid.friction.step(*link_inputs)
         k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
-        gap = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:
             point, link, wheels = *pause(k, before, dt), None
         elif gap:
-            point = carried(before, wheels, dt)
-            link = bridge(k, before, point, dt)
+            point, link, wheels = imu_gap.bridge(k, before, wheels, turn, dt)
         else:
             measured = self._preintegrator.integrate(segments, before.bias, self.gyro.noise(noise))
             seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias

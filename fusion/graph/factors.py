@@ -82,20 +82,6 @@ def no_motion_factor(k: int) -> gtsam.NonlinearFactor:
     )
 
 
-def bridge(k: int, before: KeyState, carried: KeyState, dt_s: float) -> gtsam.NonlinearFactorGraph:
-    """Loose links across a gap in the IMU, to the state that is `carried` there."""
-    graph = gtsam.NonlinearFactorGraph()
-    sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
-    step = before.pose.between(carried.pose)
-    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-    graph.add(
-        gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), _isotropic(3, round(2.0 * math.sqrt(dt_s), 6)))
-    )
-    same = gtsam.imuBias.ConstantBias()
-    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, _isotropic(6, 1e-3)))
-    return graph
-
-
 def pause(k: int, before: KeyState, dt_s: float) -> tuple[KeyState, gtsam.NonlinearFactorGraph]:
     """State and link after a time without samples: the old place, uncertain by what it may have driven."""
     speed = max(float(np.linalg.norm(before.velocity)), PAUSE_MPS)
@@ -103,9 +89,9 @@ def pause(k: int, before: KeyState, dt_s: float) -> tuple[KeyState, gtsam.Nonlin
     graph = gtsam.NonlinearFactorGraph()
     moved = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), moved))
-    graph.add(gtsam.BetweenFactorVector(V(k - 1), V(k), -before.velocity, _isotropic(3, round(speed, 3))))
+    graph.add(gtsam.BetweenFactorVector(V(k - 1), V(k), -before.velocity, isotropic(3, round(speed, 3))))
     same = gtsam.imuBias.ConstantBias()
-    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, _isotropic(6, 1e-3)))
+    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, isotropic(6, 1e-3)))
     return KeyState(before.pose, np.zeros(3), before.bias, before.linear), graph
 
 
@@ -136,16 +122,6 @@ def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gts
     return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured)
 
 
-def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
-    """The state after `dt` seconds by the wheels, or by its velocity where they are silent."""
-    if wheels is None:
-        step = gtsam.Pose3(gtsam.Rot3(), before.rotation.T @ before.velocity * dt)
-    else:
-        turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
-        step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)
-    return KeyState(before.pose.compose(step), before.velocity, before.bias, before.linear)
-
-
 @functools.lru_cache(maxsize=4096)
-def _isotropic(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
+def isotropic(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
     return gtsam.noiseModel.Isotropic.Sigma(dim, sigma)

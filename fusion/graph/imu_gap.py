@@ -1,0 +1,81 @@
+"""Keyframes in a gap of the IMU: the wheels carry the robot on, as surely as they alone know its turn.
+
+The scale of their turn was learned beside the gyro. Its error, a share of the turn, lasts for a time T, like
+white noise of sqrt(2 T) times its rate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.fusion.graph.factors import isotropic
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import ImuSegment
+
+UNKNOWN_DENSITY_RADPS, STRAIGHT_DENSITY_RADPS = 0.3, 0.02
+"""Yaw noise without wheels that tell a turn, and with them on a straight, rad/s/sqrt(Hz) (assumed)."""
+TURN_SHARE, TURN_TIME_S = 0.1, 10.0
+"""1 sigma of the wheels' turn as a share, and the time for which it lasts (assumed: a long turn)."""
+
+
+def turn_in_gap(
+    before: KeyState,
+    travelled_m: tuple[float, float] | None,
+    track_m: float,
+    dt_s: float,
+    held: list[ImuSegment],
+) -> tuple[float | None, list[ImuSegment]]:
+    """Turn, rad, of a robot whose sides `travelled_m`, and what an IMU would read on it at a steady speed.
+
+    None and the readings `held` where the wheels are silent.
+    """
+    if travelled_m is None:
+        return None, held
+    left_m, right_m = travelled_m
+    turn_rad = before.turning * (right_m - left_m) / track_m
+    rate = np.array([0.0, 0.0, turn_rad / dt_s])
+    force = before.rotation.T @ np.array([0.0, 0.0, GRAVITY_MPS2])
+    gyro, accel = before.bias.gyroscope() + rate, before.bias.accelerometer() + force
+    return turn_rad, [ImuSegment(dt_s, gyro, accel)]
+
+
+def bridge(
+    k: int, before: KeyState, wheels: WheelIncrement | None, turn_rad: float | None, dt_s: float
+) -> tuple[KeyState, gtsam.NonlinearFactorGraph, WheelIncrement | None]:
+    """The state after `dt_s` by the wheels, or by its velocity where they are silent; loose links to it; and
+    what the wheels still say: their turn is in the links where they alone told it.
+    """
+    after = _carried(before, wheels, dt_s)
+    graph = gtsam.NonlinearFactorGraph()
+    sigmas = np.array([0.05, 0.05, 0.0, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
+    sigmas[2] += _yaw_sigma(turn_rad, dt_s)
+    step = before.pose.between(after.pose)
+    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.add(
+        gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), isotropic(3, round(2.0 * math.sqrt(dt_s), 6)))
+    )
+    same = gtsam.imuBias.ConstantBias()
+    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, isotropic(6, 1e-3)))
+    return after, graph, wheels if wheels is None or turn_rad is None else wheels.without_turn()
+
+
+def _yaw_sigma(turn_rad: float | None, dt_s: float) -> float:
+    if turn_rad is None:
+        return UNKNOWN_DENSITY_RADPS * math.sqrt(dt_s)
+    lasting = TURN_SHARE * abs(turn_rad) * math.sqrt(2.0 * TURN_TIME_S / dt_s)
+    return math.hypot(lasting, STRAIGHT_DENSITY_RADPS * math.sqrt(dt_s))
+
+
+def _carried(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> KeyState:
+    if wheels is None:
+        step = gtsam.Pose3(gtsam.Rot3(), before.rotation.T @ before.velocity * dt_s)
+    else:
+        turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
+        step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)
+    return KeyState(before.pose.compose(step), before.velocity, before.bias, before.linear)
