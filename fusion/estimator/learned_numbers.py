@@ -19,6 +19,7 @@ from terrafusion.fusion.calibration.numbers import (
     COURSE_LAG,
     GNSS_DELAY,
     GYRO_BIAS,
+    IMITATED,
     NUMBERS,
     TURN_SCALE,
     WHEEL_SCALE,
@@ -67,6 +68,9 @@ CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 """Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
 rotation look alike (assumed)."""
+SLIP_IMITATES = np.array([0.0, 0.0, *IMITATED[[ANTENNA_Y, GNSS_DELAY]]])
+"""What wheels that skid make of a drive, for residuals with the variance of their noise and as much again; a
+correction is twice that. The place ahead is seen in every turn."""
 MOST_SPREAD = 0.1
 """Spread of slip beyond which the wheels do not roll, and a skid looks like a delay (assumed)."""
 SKID_DETECTION_NS, STEPS_KEPT = 15_000_000_000, 8
@@ -328,7 +332,10 @@ class LearnedNumbers:
         limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
         limit = limit * np.hypot(sigma[CORRECTED], UNMODELLED_SIGMA)
         rolling = known.slip_spread < MOST_SPREAD
-        self._clear = clear = (size > limit) & (size > LEAST_CORRECTION) & rolling
+        least = LEAST_CORRECTION
+        if self._skids:
+            least = np.maximum(least, 2.0 * math.sqrt(known.misfit - 1.0) * SLIP_IMITATES)
+        self._clear = clear = (size > limit) & (size > least) & rolling
         shown = [i for i, is_clear in zip(CORRECTED, clear.tolist(), strict=True) if is_clear]
         corrected[clear], _ = known.given(shown, unrefuted(known, self._before, shown), self._before)
         return corrected

@@ -18,6 +18,7 @@ from terrafusion.fusion.calibration.numbers import (
     GNSS_DELAY,
     NUMBERS,
     TURN_SCALE,
+    WHEEL_DELAY,
     WHEEL_SCALE,
     assumed,
 )
@@ -60,7 +61,7 @@ def figure(
     fix = np.interp(at, t, z.real) + 1j * np.interp(at, t, z.imag) + antenna
     fix = fix + fix_sigma_m * (rng.normal(size=len(at)) + 1j * rng.normal(size=len(at)))
     sigma = np.full(len(at), max(fix_sigma_m, 0.01))
-    distance = speed * STEP_S / ratio
+    distance = (speed - numbers[WHEEL_DELAY] * np.gradient(speed, STEP_S)) * STEP_S / ratio
     first = node_starts(t, distance, float(sigma[0]))
     return MotionSegment(t, distance, measured, stamps, fix, sigma, 0j, first)
 
@@ -139,6 +140,16 @@ def test_a_course_that_lags_in_turns_does_not_look_like_late_fixes() -> None:
     assert abs(found.mean[GNSS_DELAY]) < 0.05
     rolling = fit([drive], [(0j, 0.0)], PRIOR, NOISE)
     assert rolling.mean[GNSS_DELAY] > 0.1
+
+
+def test_wheels_that_slip_while_they_accelerate_are_ahead_by_a_time() -> None:
+    """As if they were early; that is no reason for late fixes."""
+    slipping = TRUE.copy()
+    slipping[GNSS_DELAY], slipping[WHEEL_DELAY] = 0.0, -0.3
+    drive = figure(120.0, slipping, fix_sigma_m=0.1, slip=0.01)
+    found = fit([drive], [(0j, 0.0)], assumed(0.005, False, 0.03, 300.0, skids=True), NOISE)
+    for number in (GNSS_DELAY, WHEEL_DELAY):
+        assert abs(found.mean[number] - slipping[number]) < 2.0 * found.sigma[number]
 
 
 def test_a_course_that_leads_is_none_that_lags() -> None:

@@ -17,6 +17,7 @@ from terrafusion.fusion.calibration.numbers import (
     NUMBERS,
     SKIDDING_LAG_SIGMA_S,
     TURN_SCALE,
+    WHEEL_DELAY,
     WHEEL_SCALE,
     Knowledge,
     assumed,
@@ -86,6 +87,19 @@ def test_a_delay_corrects_from_four_of_its_sigmas_on(sigma_s: float, corrected_s
     assert estimator.gnss.delay_s == pytest.approx(corrected_s)
 
 
+@pytest.mark.parametrize(("misfit", "corrected_s"), [(1.0, 0.5), (3.0, 0.5), (5.0, 0.0)])
+def test_a_delay_of_wheels_that_skid_is_corrected_beyond_what_their_slip_imitates(
+    misfit: float, corrected_s: float
+) -> None:
+    """Fixes that lie far from a path by rolling wheels show slip, which looks like a delay."""
+    estimator = Estimator.for_vehicle("elevate", "fixed")
+    prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
+    mean, sigma = prior.mean.copy(), prior.sigma
+    mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.5, 0.02
+    estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03, 300.0, misfit), 1)
+    assert estimator.gnss.delay_s == pytest.approx(corrected_s)
+
+
 def test_a_delay_is_not_corrected_by_what_the_antenna_explains() -> None:
     """Given an antenna at its nominal place, the fixes would be .35 s late; by both together they are not."""
     estimator = Estimator.for_vehicle("elevate", "fixed")
@@ -96,6 +110,18 @@ def test_a_delay_is_not_corrected_by_what_the_antenna_explains() -> None:
     covariance[ANTENNA_X, GNSS_DELAY] = covariance[GNSS_DELAY, ANTENNA_X] = 0.9 * 0.02 * 0.05
     estimator.learned._apply(Knowledge(mean, covariance, 0.03, 300.0), 1)
     assert estimator.gnss.delay_s == 0.0
+
+
+def test_a_delay_is_not_made_larger_by_wheels_that_slip_less_than_they_seem_to() -> None:
+    """Wheels that slip while they accelerate are early: that they do not is no assumption of a delay."""
+    estimator = Estimator.for_vehicle("elevate", "fixed")
+    prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
+    mean, covariance = prior.mean.copy(), prior.covariance.copy()
+    mean[GNSS_DELAY], mean[WHEEL_DELAY] = 0.3, -0.15
+    covariance[GNSS_DELAY, GNSS_DELAY] = covariance[WHEEL_DELAY, WHEEL_DELAY] = 0.05**2
+    covariance[GNSS_DELAY, WHEEL_DELAY] = covariance[WHEEL_DELAY, GNSS_DELAY] = 0.8 * 0.05**2
+    estimator.learned._apply(Knowledge(mean, covariance, 0.03, 300.0), 1)
+    assert estimator.gnss.delay_s == pytest.approx(0.3)
 
 
 def test_a_stated_sigma_holds_what_slip_imitates_but_no_more_than_was_known() -> None:
