@@ -35,8 +35,8 @@ def read_vehicle(name_or_path: str | Path) -> tuple[dict[str, Any], str]:
 
 
 def is_short(raw: dict[str, Any]) -> bool:
-    """Whether the content of a file is of the short form: a complete one has a name."""
-    return "robot" in raw and "name" not in raw
+    """Whether the content of a file is of the short form: a complete one has a body."""
+    return "body" not in raw and not raw.keys().isdisjoint({"robot", *PLACES})
 
 
 def _read(name_or_path: str | Path, above: tuple[str, ...]) -> tuple[dict[str, Any], str]:

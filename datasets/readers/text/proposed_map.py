@@ -72,6 +72,10 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         for a in "xyz"
     ),
     *((_beside(_SPEED, s), "wheels", (f"{side}_mps", f"{side}_radps")) for side, s in _SIDES.items()),
+    *(
+        (rf"(?:wheel_)?(?:{s})(?:_wheel)?", "wheels", (f"{side}_mps", f"{side}_radps"))
+        for side, s in _SIDES.items()
+    ),
     *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
     *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
     (r"v|vel|velocity|speed|wheel_speed", "wheels", ("speed_mps",)),

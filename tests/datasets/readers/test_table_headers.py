@@ -80,3 +80,11 @@ def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
     path.write_text("t_s,speed_mps\n0,1\n", encoding="utf-16")
     with pytest.raises(DataError, match=r"excel\.csv: is text in UTF-16; save it as UTF-8"):
         open_recording(path)
+
+
+@pytest.mark.parametrize("names", ["t,left,right", "t,left_wheel,right_wheel", "t;wheel_l;wheel_r"])
+def test_columns_that_name_only_a_side_are_proposed_as_wheels(tmp_path: Path, names: str) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text(f"{names}\n0,1,1\n")
+    with pytest.raises(DataError, match=r"wheels: \{left_mps: .*, right_mps: "):
+        open_recording(path)

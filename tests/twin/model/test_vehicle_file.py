@@ -67,6 +67,13 @@ def test_the_twin_drives_a_short_file(tmp_path: Path) -> None:
     assert log.duration_s() > 5.0
 
 
+@pytest.mark.parametrize("wrong", [f"name: mine\n{SHORT}", "drive: tracked\ntrack_m: 0.5\n"])
+def test_keys_beside_the_robot_are_no_reason_to_ask_for_a_whole_twin(tmp_path: Path, wrong: str) -> None:
+    with pytest.raises(ConfigError, match="known here: robot") as raised:
+        load_vehicle(written(tmp_path / "own.yaml", wrong))
+    assert "realism" not in str(raised.value)
+
+
 def test_all_errors_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     wrong = """\
 robot:
