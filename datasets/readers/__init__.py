@@ -22,6 +22,13 @@ Helpers: `delimited` parses text tables, `text.fixes` places latitudes and longi
 channels of columns with the log folder's names. Then add a sample to tests/datasets/fuzz_samples.py.
 """
 
-from terrafusion.datasets.readers.open import NOT_USED, files_of, hashes_of, open_recording, open_recordings
+from terrafusion.datasets.readers.open import (
+    CUT_OFF,
+    NOT_USED,
+    files_of,
+    hashes_of,
+    open_recording,
+    open_recordings,
+)
 
-__all__ = ["NOT_USED", "files_of", "hashes_of", "open_recording", "open_recordings"]
+__all__ = ["CUT_OFF", "NOT_USED", "files_of", "hashes_of", "open_recording", "open_recordings"]

@@ -16,6 +16,8 @@ from terrafusion.datasets.readers.formats import Format, Request, format_of
 STAMPS = ("header", "receipt")
 NOT_USED = "not used here"
 """How a note ends on an option that means nothing for the format of a log."""
+CUT_OFF = "cut off"
+"""In every note on a file that ends too early."""
 
 
 def open_recordings(

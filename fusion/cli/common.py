@@ -160,7 +160,7 @@ class HowRead:
         from terrafusion.datasets.readers import open_recording
 
         recording = open_recording(log, **self.options(rig))
-        warn_unused(log, [recording])
+        warn_of_log(log, [recording])
         return clock_accepted(recording) if self.repair_clock else recording
 
     def open_all(self, names: Sequence[str], rig: Rig | None) -> list[Recording]:
@@ -173,7 +173,7 @@ class HowRead:
         for name in names:
             log, cut = split_name(name)
             read = open_recordings(log, **options)
-            warn_unused(log, read)
+            warn_of_log(log, read)
             for recording in read:
                 found += [recording] if cut is None else cut.of(recording)
         return [clock_accepted(r) for r in found] if self.repair_clock else found
@@ -189,12 +189,12 @@ def styled(line: str | Line) -> str:
     return word + space + rest
 
 
-def warn_unused(log: str, recordings: Sequence[Recording]) -> None:
-    """A line on standard error for each option that means nothing for the format of a log."""
-    from terrafusion.datasets.readers import NOT_USED
+def warn_of_log(log: str, recordings: Sequence[Recording]) -> None:
+    """A line on standard error for a log that is cut off, and for each option that means nothing for it."""
+    from terrafusion.datasets.readers import CUT_OFF, NOT_USED
 
     for note in recordings[0].notes if recordings else ():
-        if note.endswith(NOT_USED):
+        if note.endswith(NOT_USED) or (CUT_OFF in note and not note.endswith("?")):
             print(f"warning: {log}: {note}", file=sys.stderr)
 
 

@@ -48,7 +48,7 @@ def convert(
 
     rig = common.load_rig(vehicle)
     recording = open_recording(log, **replace(how, repair_clock=how.repair_clock or apply_fixes).options(rig))
-    common.warn_unused(log, [recording])
+    common.warn_of_log(log, [recording])
     if how.repair_clock:
         recording = common.clock_accepted(recording)
     rig = common.rig_of(recording, rig)

@@ -69,7 +69,7 @@ def inspected(
 
     rig = common.load_rig(vehicle)
     recordings = open_recordings(log, **common.HowRead(topic, stamps, columns, True).options(rig))
-    common.warn_unused(log, recordings)
+    common.warn_of_log(log, recordings)
     findings = [run_checks(recording, common.rig_of(recording, rig)) for recording in recordings]
     measures = measure(recordings, common.rig_of(recordings[0], rig))
     if len(recordings) == 1:

@@ -160,6 +160,7 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     recording = open_recording(
         log, rig=common.load_rig(options.vehicle), topics=dict(options.topics), stamps=options.stamps
     )
+    common.warn_of_log(log, [recording])
     newest: list[State] = []
 
     def publish(state: State) -> None:

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import Terrafusion
+from tests.datasets.readers.test_cut_files import ros1_bag
+
 pytestmark = pytest.mark.usefixtures("quick")
 
 Spoil = Callable[[Path], object]
@@ -273,3 +276,13 @@ def test_fixes_without_sigma_have_that_of_their_class(good_log: Path, tmp_path: 
     assert (outcome.status, outcome.err) == (0, "")
     assert "no usable GNSS fix" not in outcome.out
     assert "131 fixes have no sigma" in outcome.out
+
+
+@pytest.mark.parametrize("command", ["inspect", "live"])
+def test_a_log_that_is_cut_off_says_so(command: str, tmp_path: Path, terrafusion: Terrafusion) -> None:
+    whole = ros1_bag(tmp_path / "whole.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(whole[: len(whole) * 3 // 4])
+    words = ("--vehicle", "husky") if command == "live" else ()
+    found = terrafusion(command, tmp_path / "cut.bag", *words)
+    assert "cut.bag is cut off" in found.err
+    assert "its data end at t = " in found.err
