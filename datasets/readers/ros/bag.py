@@ -70,6 +70,8 @@ def opened_bag(
             with broken_bag_on_error():
                 container = open_container(path)
             with closing(container):
+                if container.cut and not any(source.count for source in container.sources):
+                    raise BagError(f"{container.cut}, and no message is there")
                 yield container
         except BagError as error:
             what = f"cannot be read as a ROS bag: {str(error)[:MOST_TEXT]}"

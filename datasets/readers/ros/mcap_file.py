@@ -42,7 +42,7 @@ class McapFile:
     """An open MCAP file.
 
     Raises:
-        BagError: the file breaks the format, or is cut off before its first message.
+        BagError: the file breaks the format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,8 +57,6 @@ class McapFile:
             counts = summary.statistics.channel_message_counts if summary.statistics is not None else {}
             self._counts = counts if self._is_known(counts) else self._counted()
             self.sources = [self._source(number) for number in sorted(self._channels)]
-            if self.cut and not any(source.count for source in self.sources):
-                raise BagError(f"{self.cut}, and no message is there")
         except BaseException:
             self.close()
             raise

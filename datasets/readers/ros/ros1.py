@@ -63,7 +63,7 @@ class Ros1File:
     """An open ROS 1 bag.
 
     Raises:
-        BagError: the file breaks the format, or is cut off before its first message.
+        BagError: the file breaks the format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -151,8 +151,6 @@ class Ros1File:
             if count > limits.ROWS:
                 raise limits.too_much("messages", limits.ROWS)
             self._chunks.append(chunk._replace(places=places))
-        if not count:
-            raise BagError(f"{self.cut}, and no message is there")
 
     def _places(self, data: bytes) -> dict[int, NDArray[Any]]:
         """Places of the complete messages of a chunk, by connection; its connections become known."""

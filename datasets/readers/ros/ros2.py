@@ -52,7 +52,7 @@ class Db3File:
     changes that a killed recorder leaves beside it is applied to the copy.
 
     Raises:
-        BagError: it is not such a database, or cut off before its first message.
+        BagError: it is not such a database.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,8 +110,6 @@ class Db3File:
         if not {"topics", "messages"} <= tables:
             raise BagError("the database has no tables of topics and messages")
         counts = Counter(number for (number,) in self._rows("SELECT topic_id FROM messages ORDER BY id"))
-        if self.cut and not counts:
-            raise BagError(f"{self.cut}, and no message is there")
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
