@@ -49,7 +49,7 @@ ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
 GNSS_DELAY_SIGMA_S = 0.5
 """Receivers without a common clock report up to seconds late (assumed)."""
-SKIDDING_WHEEL_SIGMA_S, ROLLING_WHEEL_SIGMA_S = 0.2, 0.1
+SKIDDING_WHEEL_SIGMA_S, ROLLING_WHEEL_SIGMA_S = 0.2, 0.05
 """Prior of the wheels' delay: a queue, and slip of wheels that accelerate (assumed; 0.1 to 0.4 s on skidding
 robots of `unseen_robots` below seed 24)."""
 SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
