@@ -36,6 +36,21 @@ TWIN = (
         spread=True,
     ),
     Study(
+        "unseen_gap",
+        "Does the diagnosis see and name changes of robots that no part of the library made?",
+        module("unseen_gap.study", "--out", OUT),
+        25,
+        {
+            "alarms": r"false alarms, same drives: (\d+ of \d+)",
+            "alarms_other": r"false alarms, other drives: (\d+ of \d+)",
+            "large": r"large, detected: (\d+ of \d+)",
+            "large_named": r"large, right effect in a named set: (\d+ of \d+)",
+            "small": r"small, detected: (\d+ of \d+)",
+            "small_named": r"small, right effect in a named set: (\d+ of \d+)",
+        },
+        spread=True,
+    ),
+    Study(
         "engine_accuracy",
         "How accurate is the twin's integrator at its own step?",
         module("engine_accuracy"),
