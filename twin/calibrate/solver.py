@@ -142,6 +142,10 @@ def _passes(whole: bool) -> list[tuple[Learn | None, float]]:
     return [(raised, GOALS[0]), *white, *[(learnt_noise, GOALS[1])] * CORRELATED_PASSES]
 
 
+DIVERGED = 1e30
+"""Residuals or derivatives as large as that are of a twin that is not stable."""
+
+
 class _Evaluator:
     """Residuals at a point; counts the runs of the twin and reports the progress."""
 
@@ -151,7 +155,7 @@ class _Evaluator:
         self.low, self.high = bounds[:, 0], bounds[:, 1]
 
     def __call__(self, point: Point) -> list[ResidualBlock] | None:
-        """None where the twin diverges."""
+        """None where the twin diverges, or its derivatives do."""
         self.runs += 1
         if self.progress is not None:
             self.progress(min(0.95, 1.0 - math.exp(-self.runs / 6.0)))
@@ -159,8 +163,8 @@ class _Evaluator:
             blocks = self.problem.blocks(point)
         except TerrafusionError:
             return None
-        finite = all(np.isfinite(b.residual).all() and np.isfinite(b.change).all() for b in blocks)
-        return blocks if finite else None
+        largest = max(float(np.abs(values).max()) for b in blocks for values in (b.residual, b.change))
+        return blocks if largest < DIVERGED else None
 
 
 def _descend(

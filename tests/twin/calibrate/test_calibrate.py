@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from terrafusion.twin.calibrate.files import write_files
 from terrafusion.twin.calibrate.log import prepare
 from terrafusion.twin.calibrate.model import Model, resolve
 from terrafusion.twin.calibrate.predict import predict
-from terrafusion.twin.calibrate.problem import Point, Problem
+from terrafusion.twin.calibrate.problem import Point, Problem, ResidualBlock
 from terrafusion.twin.calibrate.suggest import suggest
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -240,6 +241,22 @@ def test_logs_that_lack_what_is_needed() -> None:
     lost = dataclasses.replace(drive(), terrain=None, terrain_name="moon")
     with pytest.raises(DataError, match="no soil of the library"):
         calibrate(lost, "elevate", None, NAMES[2:])
+
+
+def test_a_step_to_where_derivatives_diverge_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, calls = Problem.blocks, itertools.count()
+
+    def blocks(self: Problem, point: Point) -> list[ResidualBlock]:
+        found = plain(self, point)
+        if next(calls) == 1:
+            found[0] = dataclasses.replace(found[0], change=np.full_like(found[0].change, 1e200))
+        return found
+
+    monkeypatch.setattr(Problem, "blocks", blocks)
+    found = calibrate(drive(), soils=SOIL, parameters=NAMES)
+    assert found.converged()
+    for f in found.fitted:
+        assert abs(f.value - TRUTH[f.name]) < 4.0 * f.sigma
 
 
 def test_a_dead_time_among_the_effects_delays_the_inputs_as_that_of_the_vehicle_does() -> None:
