@@ -39,7 +39,7 @@ TWIN = (
         "unseen_gap",
         "Does the diagnosis see and name changes of robots that no part of the library made?",
         module("unseen_gap.study", "--out", OUT),
-        25,
+        12,
         {
             "alarms": r"false alarms, same drives: (\d+ of \d+)",
             "alarms_other": r"false alarms, other drives: (\d+ of \d+)",

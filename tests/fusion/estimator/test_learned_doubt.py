@@ -94,7 +94,7 @@ def test_a_delay_of_wheels_that_skid_is_corrected_beyond_what_their_slip_imitate
     """Fixes that lie far from a path by rolling wheels show slip, which looks like a delay."""
     estimator = Estimator.for_vehicle("elevate", "fixed")
     prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
-    mean, sigma = prior.mean.copy(), prior.sigma
+    mean, sigma = prior.mean.copy(), prior.sigma.copy()
     mean[GNSS_DELAY], sigma[GNSS_DELAY] = 0.5, 0.02
     estimator.learned._apply(Knowledge(mean, np.diag(sigma**2), 0.03, 300.0, misfit), 1)
     assert estimator.gnss.delay_s == pytest.approx(corrected_s)

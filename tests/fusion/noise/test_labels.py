@@ -38,14 +38,20 @@ def test_labels_that_do_not_fit_their_times_are_refused(times, names) -> None:
 
 def test_the_estimator_takes_the_row_of_the_label() -> None:
     recording = simulate("figure_eight", terrain="loose_sand", seed=1)
+    labels = GroundLabels((START_NS,), ("loose_sand",))
+    told = replay(recording, settings={"labels": labels}).estimate
+    after = told.trajectory.t_ns > told.trajectory.t_ns[0]
+    assert set(told.dominant_terrain()[after]) == {"loose_sand"}
+    row = load_policy().classes["loose_sand"]
+    settled = told.trajectory.t_ns > SWITCH_NS
+    np.testing.assert_allclose(told.weights["side_slip_sigma"][settled], row.side_slip_sigma, rtol=1e-12)
+
+
+def test_a_label_that_the_wheels_contradict_is_not_followed_for_long() -> None:
+    recording = simulate("figure_eight", terrain="loose_sand", seed=1)
     told = replay(recording, settings={"labels": LABELS}).estimate
-    after = told.trajectory.t_ns > SWITCH_NS + 10**9
-    ground = told.dominant_terrain()
-    before = told.trajectory.t_ns < SWITCH_NS
-    assert set(ground[before & (told.trajectory.t_ns > told.trajectory.t_ns[0])]) <= {"mud"}
-    assert set(ground[after]) == {"asphalt"}
-    row = load_policy().classes["asphalt"]
-    np.testing.assert_allclose(told.weights["side_slip_sigma"][after], row.side_slip_sigma, rtol=1e-12)
+    after = told.trajectory.t_ns > SWITCH_NS
+    assert (told.dominant_terrain()[after] != "asphalt").mean() > 0.9
 
 
 def test_a_dump_with_labels_goes_on() -> None:

@@ -1,6 +1,6 @@
 """The diagnosis on robots in MuJoCo: false alarms, effects detected and effects named.
 
-    python -m tests.studies.unseen_gap.study --out FOLDER [--robots 4] [--first-seed 100]
+    python -m tests.studies.unseen_gap.study --out FOLDER [--robots 2] [--first-seed 100]
 
 References are 12 runs of a minute between random way points, judged are three. The owner states mass, wheel
 radius, track, wheelbase and the places of the sensors, and calls the ground grass; all else of the twin is
@@ -159,7 +159,7 @@ def main() -> int:
     parser.add_argument(
         "--out", type=Path, required=True, help="folder for parts; the same command continues"
     )
-    parser.add_argument("--robots", type=int, default=4)
+    parser.add_argument("--robots", type=int, default=2)
     parser.add_argument("--first-seed", type=int, default=100)
     add_options(parser)
     given = parser.parse_args()
