@@ -249,8 +249,10 @@ class LearnedNumbers:
     def _uncorrected_delay_s(self) -> tuple[float, float] | None:
         if self.calibration is None or self._clear[CORRECTED.index(GNSS_DELAY)]:
             return None
-        delay_s = self._known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY]
-        return float(delay_s), float(self._known.sigma[GNSS_DELAY])
+        known, at = self._known, CORRECTED.index(GNSS_DELAY)
+        delay_s = known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY]
+        slip_s = math.sqrt(known.misfit - 1.0) * SLIP_IMITATES[at] if self._skids else 0.0
+        return float(delay_s), math.hypot(float(known.sigma[GNSS_DELAY]), slip_s)
 
     def _of_fixes(self, prior: Knowledge) -> list[NumberAfterDrive]:
         mean, sigma = self._known.mean.tolist(), self._known.stated_sigma(prior).tolist()

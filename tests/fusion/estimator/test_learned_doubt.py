@@ -281,3 +281,17 @@ def test_the_doubt_of_a_place_is_computed_only_where_a_number_has_changed() -> N
 def test_an_estimator_that_learns_nothing_of_its_sensors_takes_them_for_exact() -> None:
     config = EstimatorConfig(load_vehicle("husky").rig(), "husky", self_calibrate=False)
     assert not Estimator(config).learned.place_moments().any()
+
+
+@pytest.mark.parametrize(("misfit", "likely"), [(1.0, True), (8.0, False)])
+def test_a_delay_that_skidding_wheels_may_imitate_is_not_likely(misfit: float, likely: bool) -> None:
+    """The verdict doubts fixes that are late by two sigma and more."""
+    estimator = Estimator.for_vehicle("elevate", "fixed")
+    prior = estimator.learned.calibration.prior  # type: ignore[union-attr]
+    mean, sigma = prior.mean.copy(), prior.sigma.copy()
+    mean[GNSS_DELAY], sigma[GNSS_DELAY] = -0.16, 0.06
+    estimator.learned._known = Knowledge(mean, np.diag(sigma**2), 0.03, 300.0, misfit)
+    late = estimator.learned.corrections().uncorrected_delay_s
+    assert late is not None
+    assert late[0] == pytest.approx(-0.16)
+    assert (abs(late[0]) > 2.0 * late[1]) == likely
