@@ -16,8 +16,8 @@ class Corrections:
         imu_since_ns: when the samples of a turned IMU began to be turned back; None for one that is not.
         imu_sigma_rad: 1 sigma of the angle of the IMU about z at the end; None where it is not learned.
         antenna: lever arms and delays of the fixes as they were used.
-        uncorrected_delay_s: lateness of the fixes beyond what was known, and its 1 sigma; None where it was
-            corrected or not learned.
+        uncorrected_delay_s: lateness of the fixes beyond what was known, and its 1 sigma with what skidding
+            wheels imitate; None where it was corrected or not learned.
     """
 
     numbers: frozenset[str] = frozenset()

@@ -49,7 +49,7 @@ def bridge(
     k: int, before: KeyState, wheels: WheelIncrement | None, turn_rad: float | None, dt_s: float
 ) -> tuple[KeyState, gtsam.NonlinearFactorGraph, WheelIncrement | None]:
     """The state after `dt_s` by the wheels, or by its velocity where they are silent; loose links to it; and
-    what the wheels still say: their turn is in the links where they alone told it.
+    what the wheels still say: their turn is in the links where they alone show it.
     """
     after = _carried(before, wheels, dt_s)
     graph = gtsam.NonlinearFactorGraph()

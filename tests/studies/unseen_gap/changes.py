@@ -1,4 +1,8 @@
-"""Robots of the study and what is changed on them; both were written down before any was diagnosed."""
+"""Robots of the study and what is changed on them; both were fixed before a judged robot was diagnosed.
+
+Stiffness of the motors, inertia of the rotors, wheelbase and size of the friction were set on how robots turn
+and follow their commands.
+"""
 
 from __future__ import annotations
 

@@ -58,6 +58,15 @@ def with_observed(log: PreparedLog, observed: Sequence[Observed]) -> PreparedLog
     return out
 
 
+def by_channel(log: PreparedLog, values: Array) -> list[Array]:
+    """Values (n,) of all samples as one array a channel, zero outside the windows."""
+    out, place = [np.zeros(len(o.value)) for o in log.observed], 0
+    for i, _, rows in sample_map(log).blocks:
+        out[i][rows] = values[place : place + len(rows)]
+        place += len(rows)
+    return out
+
+
 def coarse_subset(log: PreparedLog) -> Indices:
     """Which of all samples of the windows are the coarse ones."""
     starts = log.first_samples()

@@ -28,9 +28,8 @@ CHANGE_FREEDOM = 4
 JITTER = 0.02  # variance added to a standardised score (assumed): no combination of them is taken as exact
 WIDE, UNKNOWN_SIZES = 10.0, (0.3, 1.0, 3.0, 10.0)
 """1 sigma of an effect's size, in typical ones, and those of an unknown cause's (assumed)."""
-LEAST_MEAN = (
-    1e-12  # least mean square of a deviation: columns that the logs have no channel for deviate by none
-)
+LEAST_MEAN = 1e-12
+"""Least mean square of a deviation: columns that no channel of the logs shows do not deviate."""
 REPLICATES, LOWEST = 1000, 20
 """Replicates, and how many of the lowest show the tail, where p-values are proportional to the statistic."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost

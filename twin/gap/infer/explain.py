@@ -197,11 +197,8 @@ def explain(
     look = own.look(bank)
     _, _, used = look.laws.best(look.metric)
     # Close look: alone and in pairs, each with the discrepancy of its law.
-    wanted, weight, normal = (
-        {i: used[i] for i in sizes},
-        np.ones(len(evidence.channels)),
-        own.normal_energies(),
-    )
+    wanted, weight = {i: used[i] for i in sizes}, np.ones(len(evidence.channels))
+    normal = own.normal_energies()
     plain = list[Products]()
     for _ in range(WEIGHINGS):
         runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, wanted, weight)

@@ -9,7 +9,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, sheet_correlation
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import Indices, sample_map
+from terrafusion.twin.gap.data.samples import Indices, by_channel, sample_map
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.residuals import (
     RunResiduals,
@@ -114,12 +114,7 @@ def _fit_residuals(
     prior = np.append(sigma**-2.0, np.full(run.effects, size**-2.0))
     rows, K = white.rows.astype(float), len(prior)
     fit = np.linalg.solve(white.gram[:K, :K] + np.diag(prior), white.gram[:K, -1])
-    rest = physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit)
-    out, first = [np.zeros(len(o.value)) for o in run.log.observed], 0
-    for i, _, mine in sample_map(run.log).blocks:
-        out[i][mine] = rest[first : first + len(mine)]
-        first += len(mine)
-    return out
+    return by_channel(run.log, physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit))
 
 
 def _series(

@@ -24,6 +24,9 @@ SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2 = 0.3, 0.3, 0.6
 LEAST_S = 1.0  # time of all references in a cell from which it counts as covered (assumed)
 MOST_LISTED = 4
 LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
+SPREAD_SIGMAS = 2.0
+"""By so many standard deviations of what references have in common, judged drives may have less (set on the
+development robots of the study `unseen_gap`)."""
 MOSTLY_COVERED = 0.8
 """Share of the judged time from which the drives do not limit the answer (assumed)."""
 
@@ -81,8 +84,7 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
 
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     """Share of the commands, by time, that runs and references have in common, over that of as many of the
-    references with the rest, less two standard deviations of one of these; at most one. Twists as for
-    `coverage`."""
+    references with the rest, less `SPREAD_SIGMAS` of one of these; at most one. Twists as for `coverage`."""
     size, known = min(len(runs), len(references) // 2), [by_cell(twist) for twist in references]
     if not size:
         return 1.0
@@ -91,7 +93,8 @@ def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
         for i in range(0, len(known) - size + 1, size)
     ]
     alone = [_in_common([one], [*known[:i], *known[i + 1 :]]) for i, one in enumerate(known)]
-    usual = float(np.mean(own)) * (1.0 - 2.0 * float(np.std(alone)) / max(float(np.mean(alone)), 1e-9))
+    spread = float(np.std(alone)) / max(float(np.mean(alone)), 1e-9)
+    usual = float(np.mean(own)) * (1.0 - SPREAD_SIGMAS * spread)
     return min(_in_common([by_cell(twist) for twist in runs], known) / max(usual, 1e-9), 1.0)
 
 

@@ -22,7 +22,7 @@ from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import aligned_start
-from terrafusion.twin.gap.data.samples import Indices, sample_map, with_observed
+from terrafusion.twin.gap.data.samples import Indices, by_channel, sample_map, with_observed
 from terrafusion.twin.gap.rollout.nuisance import nuisance_columns
 from terrafusion.twin.gap.rollout.sensitivities import (
     Linearisation,
@@ -347,14 +347,8 @@ def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: 
         out[places] = noise[observed.channel].unwhiten_alike(
             observed.slot[rows[0]], sigma[i][rows], error[places]
         )
-    blocks = sample_map(run.log).blocks
-    parts = [np.zeros((len(o.value), 1)) for o in run.log.observed]
-    place = 0
-    for i, _, rows in blocks:
-        parts[i][rows, 0] = out[place : place + len(rows)]
-        place += len(rows)
-    whole = with_shared(run.log, gains_of(noise), parts)
-    return np.concatenate([whole[i][rows, 0] for i, _, rows in blocks])
+    whole = with_shared(run.log, gains_of(noise), [c[:, None] for c in by_channel(run.log, out)])
+    return np.concatenate([whole[i][rows, 0] for i, _, rows in sample_map(run.log).blocks])
 
 
 def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:

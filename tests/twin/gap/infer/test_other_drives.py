@@ -286,3 +286,14 @@ def test_columns_that_a_log_has_no_channel_for_are_no_gap() -> None:
 def test_beyond_all_replicates_the_p_value_goes_on_falling() -> None:
     large, larger = (p_value(3, "reference", effect=size) for size in (30.0, 300.0))
     assert larger < large < 1.0 / 1001.0
+
+
+def test_columns_that_act_alike_share_modestly_what_they_explain() -> None:
+    """With a wide prior two columns that all but cancel are large; what they explain together stays."""
+    pair = np.array([[1.0, -0.9999], [-0.9999, 1.0]]) * 400.0
+    references = [Score(pair @ np.array([12.0, 10.0]), pair)] * 6
+    scatter = np.full(2, 0.01)
+    wide = RobotOffsets(np.zeros(2), np.eye(2), scatter, np.full(2, 400.0), 6).of(references)
+    modest = wide.modest(references)
+    assert np.abs(modest.mean).max() < 0.5 * np.abs(wide.mean).max()
+    assert pair @ modest.mean == pytest.approx(pair @ wide.mean, rel=0.1)

@@ -32,6 +32,17 @@ def test_a_moment_does_not_cover() -> None:
     assert found.covered == pytest.approx(0.0)
 
 
+def test_drives_may_differ_from_the_references_as_these_do_among_themselves() -> None:
+    """One of four references is unlike the others, and the judged drive is like that one."""
+
+    def drive(*speeds_mps: float) -> np.ndarray:
+        return np.concatenate([np.full((3000, 2), [v, 0.0]) for v in speeds_mps])
+
+    usual, other = drive(0.6, 1.2), drive(1.2, 1.8)
+    assert overlap([other], [usual, usual, usual, other]) == 1.0
+    assert overlap([other], [usual] * 4) < 0.6
+
+
 def test_overlap_is_beside_that_of_the_references_themselves() -> None:
     slow, fast = steady(0.3, 0.0, 20.0), steady(0.9, 0.0, 20.0)
     both = np.concatenate([slow, fast])
