@@ -22,7 +22,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.fusion.terrain.features import FEATURES, SLIP
+from terrafusion.fusion.terrain.features import FEATURES, SLIP, Window, extract
+from terrafusion.fusion.terrain.spectrum import SpectrumClassifier, SpectrumFile, band_levels
 
 SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
@@ -63,6 +64,7 @@ class TerrainModel:
         patch_length_m: expected distance between two changes of ground.
         vehicles: names of the vehicles whose vibration the model knows.
         slip_only: use the slip alone; see `for_vehicle`.
+        spectrum: of a model of one robot's own logs: tells its grounds apart by their vibration.
         scores: held-out figures of the training.
         inputs: name -> SHA-256 of the files of logs that it was trained on.
     """
@@ -76,6 +78,7 @@ class TerrainModel:
     made_by: str = ""
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
     slip_only: bool = False
+    spectrum: SpectrumClassifier | None = None
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def for_vehicle(self, name: str | None) -> Self:
@@ -105,6 +108,7 @@ class TerrainModel:
             unknown=unknown,
             temperature=max(self.temperature, SLIP_TEMPERATURE),
             slip_only=True,
+            spectrum=None,
         )
 
     def prior(self, classes: tuple[str, ...]) -> Array:
@@ -139,12 +143,34 @@ class LikelihoodTable:
         self._starts = np.cumsum([0] + [len(m.log_weight) for m in mixtures[:-1]])
         self._temperature = model.temperature
         self._judged = np.arange(len(FEATURES)) == SLIP if model.slip_only else np.ones(len(FEATURES), bool)
+        self._by_vibration, self._spectrum = not model.slip_only, model.spectrum
+        grounds = () if model.spectrum is None else model.spectrum.grounds
+        self._grounds = np.array([classes.index(name) for name in grounds], dtype=int)
+
+    def of_window(self, window: Window) -> Array:
+        """Tempered log-likelihoods (k,) of a window, known up to a constant.
+
+        With a classifier of the spectrum, the densities of the vibration tell whether the ground is one of
+        those it knows, the classifier which of these: p(x | c) = P(c | spectrum) sum of p(x | known).
+        """
+        values, variances = extract(window, self._by_vibration)
+        told = None if self._spectrum is None else self._spectrum.log_probabilities(band_levels(window))
+        if told is None:
+            return self.evaluate(values, variances)
+        is_slip = np.arange(len(FEATURES)) >= SLIP
+        vibration = self._log_densities(np.where(is_slip, np.nan, values), variances)
+        vibration[self._grounds] = np.logaddexp.reduce(vibration[self._grounds]) + told
+        slips = self._log_densities(np.where(is_slip, values, np.nan), variances)
+        return np.asarray((vibration + slips) / self._temperature)
 
     def evaluate(self, values: Array, variances: Array) -> Array:
         """Tempered log-likelihoods (k,) of the features (d,); zeros when none was observed.
 
         `variances` (d,) are those of the measurements themselves, added to the classes' own.
         """
+        return np.asarray(self._log_densities(values, variances) / self._temperature)
+
+    def _log_densities(self, values: Array, variances: Array) -> Array:
         seen = np.flatnonzero(np.isfinite(values) & self._judged)
         if not seen.size:
             return np.zeros(len(self._starts))
@@ -156,7 +182,7 @@ class LikelihoodTable:
         top = np.maximum.reduceat(log_p, self._starts)
         sizes = np.diff(np.append(self._starts, len(log_p)))
         sums = np.add.reduceat(np.exp(log_p - np.repeat(top, sizes)), self._starts)
-        return np.asarray((top + np.log(sums)) / self._temperature)
+        return np.asarray(top + np.log(sums))
 
 
 _FEATURE_VALUES = Quantity("", size=len(FEATURES))
@@ -185,6 +211,7 @@ class TerrainModelFile:
     classes: dict[str, tuple[ComponentFile, ...]]
     unknown: tuple[ComponentFile, ...]
     scores: dict[str, Any]
+    spectrum: SpectrumFile | None = None
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -213,6 +240,7 @@ def load_terrain_model(path: Path | None = None) -> TerrainModel:
         inputs_sha256=content.inputs_sha256,
         made_by=content.made_by,
         scores=content.scores,
+        spectrum=None if content.spectrum is None else SpectrumClassifier.of_file(content.spectrum),
         inputs=content.inputs,
     )
 
@@ -226,6 +254,11 @@ def _problems(content: TerrainModelFile) -> Iterator[tuple[str, str]]:
         )
     if not content.classes or UNKNOWN in content.classes:
         yield "'classes' must map class names to mixtures, without 'unknown'", again
+    told = content.spectrum
+    if told is not None and not set(told.weights) == set(told.offsets) == set(content.classes):
+        yield "'spectrum' has not the grounds of 'classes'", again
+    if told is not None and not min(told.scale) > 0.0:
+        yield "'spectrum.scale' must be positive", again
     densities = {f"classes.{name}": parts for name, parts in content.classes.items()}
     for key, parts in (densities | {UNKNOWN: content.unknown}).items():
         if not parts:

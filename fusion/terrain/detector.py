@@ -7,7 +7,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
 from terrafusion.fusion.terrain.credit import SourceCredit
-from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, extract
+from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.terrain.sequence import PatchFilter
 
 __all__ = ["TerrainDetector", "Window"]
@@ -41,7 +41,7 @@ class TerrainDetector:
                 remedy="mend the policy",
             )
         self.classes = classes
-        self._table, self._by_vibration = LikelihoodTable(model, classes), not model.slip_only
+        self._table = LikelihoodTable(model, classes)
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
         self.credit = SourceCredit(self._filter.prior, classes.index(UNKNOWN))
 
@@ -55,7 +55,7 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            evidence = self._table.evaluate(*extract(window, self._by_vibration))
+            evidence = self._table.of_window(window)
             self.credit.check(evidence)
             self._filter.update(evidence)
         return self.probabilities

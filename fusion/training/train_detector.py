@@ -18,6 +18,7 @@ from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
 from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter
+from terrafusion.fusion.terrain.spectrum import SpectrumClassifier
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.mixture import fit_best
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, Grid, windows_of
@@ -188,7 +189,7 @@ def _evidence(model: TerrainModel, route: LabelledRoute) -> list[tuple[float, Ar
     classes = (*model.classes, UNKNOWN)
     table = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes)
     return [
-        (w.ground_speed_mps() * w.dt_s, table.evaluate(*extract(w)), classes.index(str(label)))
+        (w.ground_speed_mps() * w.dt_s, table.of_window(w), classes.index(str(label)))
         for w, label in zip(route.windows, route.labels, strict=True)
         if w.ground_speed_mps() > MIN_SPEED_MPS
     ]
@@ -262,16 +263,31 @@ def write_model(model: TerrainModel, path: Path) -> None:
         "classes": {name: _listed(mixture) for name, mixture in model.classes.items()},
         "unknown": _listed(model.unknown),
         "scores": model.scores,
+        **({} if model.spectrum is None else {"spectrum": _spectrum(model.spectrum)}),
         **({"inputs": model.inputs} if model.inputs else {}),
     }
     dump_yaml(path, content, default_flow_style=None, width=110)
 
 
-def _listed(mixture: Mixture) -> list[dict[str, Any]]:
-    def digits(x: Any) -> Any:
-        return [digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")
+def _digits(x: Any) -> Any:
+    return [_digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")
 
+
+def _spectrum(told: SpectrumClassifier) -> dict[str, Any]:
+    rows = zip(told.grounds, told.weights.tolist(), told.offsets.tolist(), strict=True)
+    weights, offsets = {}, {}
+    for name, row, offset in rows:
+        weights[name], offsets[name] = _digits(row), _digits(offset)
+    return {
+        "mean": _digits(told.mean.tolist()),
+        "scale": _digits(told.scale.tolist()),
+        "weights": weights,
+        "offsets": offsets,
+    }
+
+
+def _listed(mixture: Mixture) -> list[dict[str, Any]]:
     return [
-        {"weight": digits(float(np.exp(w))), "mean": digits(m.tolist()), "covariance": digits(c.tolist())}
+        {"weight": _digits(float(np.exp(w))), "mean": _digits(m.tolist()), "covariance": _digits(c.tolist())}
         for w, m, c in zip(mixture.log_weight, mixture.mean, mixture.covariance, strict=True)
     ]

@@ -14,8 +14,10 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.fusion.terrain.features import Window
+from terrafusion.fusion.terrain.spectrum import band_levels
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate_each, splice
 from terrafusion.fusion.training.logged_runs import LoggedRun
+from terrafusion.fusion.training.spectrum_fit import fit_spectrum
 from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
 
 FOLDS = 5
@@ -112,8 +114,12 @@ def pieces(run: LoggedRun) -> list[tuple[list[Window], str]]:
 
 def _fitted(runs: Sequence[LoggedRun]) -> TerrainModel:
     rows: dict[str, list[Array]] = {}
+    spectra: dict[str, list[Array]] = {}
     for windows, ground in (piece for run in runs for piece in pieces(run)):
         rows.setdefault(ground, []).append(features_of(windows))
+        spectra.setdefault(ground, []).extend(band_levels(window) for window in windows)
     x = {ground: np.vstack(parts) for ground, parts in sorted(rows.items())}
     everywhere = np.all([np.isfinite(one).any(axis=0) for one in x.values()], axis=0)
-    return draft({ground: np.where(everywhere, one, np.nan) for ground, one in x.items()}, runs[0].vehicle)
+    model = draft({ground: np.where(everywhere, one, np.nan) for ground, one in x.items()}, runs[0].vehicle)
+    levels = {ground: np.array(spectra[ground]) for ground in x}
+    return dataclasses.replace(model, spectrum=fit_spectrum(levels))
