@@ -154,12 +154,12 @@ class LikelihoodTable:
         those it knows, the classifier which of these: p(x | c) = P(c | spectrum) sum of p(x | known).
         """
         values, variances = extract(window, self._by_vibration)
-        told = None if self._spectrum is None else self._spectrum.log_probabilities(band_levels(window))
-        if told is None:
+        shares = None if self._spectrum is None else self._spectrum.log_probabilities(band_levels(window))
+        if shares is None:
             return self.evaluate(values, variances)
         is_slip = np.arange(len(FEATURES)) >= SLIP
         vibration = self._log_densities(np.where(is_slip, np.nan, values), variances)
-        vibration[self._grounds] = np.logaddexp.reduce(vibration[self._grounds]) + told
+        vibration[self._grounds] = np.logaddexp.reduce(vibration[self._grounds]) + shares
         slips = self._log_densities(np.where(is_slip, values, np.nan), variances)
         return np.asarray((vibration + slips) / self._temperature)
 
@@ -254,10 +254,10 @@ def _problems(content: TerrainModelFile) -> Iterator[tuple[str, str]]:
         )
     if not content.classes or UNKNOWN in content.classes:
         yield "'classes' must map class names to mixtures, without 'unknown'", again
-    told = content.spectrum
-    if told is not None and not set(told.weights) == set(told.offsets) == set(content.classes):
+    spectrum = content.spectrum
+    if spectrum is not None and not set(spectrum.weights) == set(spectrum.offsets) == set(content.classes):
         yield "'spectrum' has not the grounds of 'classes'", again
-    if told is not None and not min(told.scale) > 0.0:
+    if spectrum is not None and not min(spectrum.scale) > 0.0:
         yield "'spectrum.scale' must be positive", again
     densities = {f"classes.{name}": parts for name, parts in content.classes.items()}
     for key, parts in (densities | {UNKNOWN: content.unknown}).items():

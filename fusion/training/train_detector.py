@@ -273,14 +273,14 @@ def _digits(x: Any) -> Any:
     return [_digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")
 
 
-def _spectrum(told: SpectrumClassifier) -> dict[str, Any]:
-    rows = zip(told.grounds, told.weights.tolist(), told.offsets.tolist(), strict=True)
+def _spectrum(classifier: SpectrumClassifier) -> dict[str, Any]:
+    rows = zip(classifier.grounds, classifier.weights.tolist(), classifier.offsets.tolist(), strict=True)
     weights, offsets = {}, {}
     for name, row, offset in rows:
         weights[name], offsets[name] = _digits(row), _digits(offset)
     return {
-        "mean": _digits(told.mean.tolist()),
-        "scale": _digits(told.scale.tolist()),
+        "mean": _digits(classifier.mean.tolist()),
+        "scale": _digits(classifier.scale.tolist()),
         "weights": weights,
         "offsets": offsets,
     }

@@ -67,7 +67,7 @@ class StaticFrames:
 
 
 def tells_turn(mounting: Mounting, frame: str, rig: Rig | None) -> bool:
-    """Whether the transforms tell how a sensor is turned. Without a turn they may just not have been told:
+    """Whether the transforms give how a sensor is turned. Where they have no turn it may be unknown to them:
     then axes that the vehicle file has for this frame hold."""
     if not np.array_equal(mounting[1], np.eye(3)) or rig is None:
         return True

@@ -100,9 +100,9 @@ def test_another_robot_does_not_use_it(model: TerrainModel) -> None:
 @given(st.lists(st.floats(-10.0, 10.0) | st.just(float("nan")), min_size=LEVELS, max_size=LEVELS))
 def test_probabilities_sum_to_one_above_their_floor(levels: list[float]) -> None:
     made = {"a": np.full((9, LEVELS), -1.0), "b": np.full((9, LEVELS), 1.0), "c": np.full((9, LEVELS), 0.0)}
-    told = fit_spectrum(made)
-    assert told is not None
-    log_p = told.log_probabilities(np.array(levels))
+    classifier = fit_spectrum(made)
+    assert classifier is not None
+    log_p = classifier.log_probabilities(np.array(levels))
     if log_p is None:
         assert np.isnan(levels).all()
         return
