@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -134,12 +135,16 @@ def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out:
 
     loaded = None if model is None else untrained_on(model, logs)
     runs = open_runs(logs, vehicle)
-    scores = cross_validated(runs) if loaded is None else scores_on(loaded, runs)
+    scores, spliced = cross_validated(runs) if loaded is None else (scores_on(loaded, runs), None)
     report = {**dataclasses.asdict(scores), "inputs": hashes_of(logs)}
+    lines = score_lines(f"{len(runs)} runs", scores)
+    if spliced is not None:
+        report["spliced"] = dataclasses.asdict(spliced)
+        lines += score_lines("routes spliced from them", spliced)
     if out is not None:
         write_text(out, to_json(report, indent=1) + "\n")
     done = "" if out is None else f"written to {out}"
-    return Result(score_lines(f"{len(runs)} runs", scores), done, finite(report))
+    return Result(lines, done, finite(report))
 
 
 def untrained_on(path: Path, logs: list[str]) -> TerrainModel:
@@ -170,13 +175,16 @@ def score_lines(name: str, scores: DetectorScores) -> list[str]:
     from terrafusion.fusion.training.detector_scores import confusion_lines
 
     median, p95, largest = scores.switch_delay_s
+    changes = [
+        f"ground change detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
+        f"within 2 s {scores.switches_in_time:.0%}; missed {scores.switches_missed:.1%}"
+    ]
     return [
         f"{name}: {scores.windows} windows",
         *confusion_lines(scores.classes, scores.confusion),
         f"macro-F1 {scores.macro_f1:.3f}; ECE {scores.ece:.3f}; unknown {scores.unknown_share:.3f}",
-        f"ground change detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
-        f"missed {scores.switches_missed:.1%}; false changes {scores.false_switches_per_min:.2f}/min",
-        f"one update {scores.update_ms:.2f} ms",
+        *([] if math.isnan(scores.switches_in_time) else changes),
+        f"false changes {scores.false_switches_per_min:.2f}/min; one update {scores.update_ms:.2f} ms",
     ]
 
 

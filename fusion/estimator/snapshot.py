@@ -34,6 +34,7 @@ from terrafusion.fusion.graph.factor_numbers import FactorNumbers, factor_from, 
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel
+from terrafusion.fusion.terrain.spectrum import SpectrumClassifier
 
 MAGIC = b"terrafusion.snapshot/1\n"
 _HEAD = len(MAGIC) + 32 + 8
@@ -45,6 +46,7 @@ _FIXED = (
     Policy,
     TerrainModel,
     LikelihoodTable,
+    SpectrumClassifier,
     Preintegrator,
     Propagator,
     gtsam.Values,

@@ -23,7 +23,7 @@ from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.features import FEATURES, SLIP, Window, extract
-from terrafusion.fusion.terrain.spectrum import SpectrumClassifier, SpectrumFile, band_levels
+from terrafusion.fusion.terrain.spectrum import SpectrumClassifier, SpectrumFile, log_probabilities
 
 SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
@@ -143,23 +143,23 @@ class LikelihoodTable:
         self._starts = np.cumsum([0] + [len(m.log_weight) for m in mixtures[:-1]])
         self._temperature = model.temperature
         self._judged = np.arange(len(FEATURES)) == SLIP if model.slip_only else np.ones(len(FEATURES), bool)
-        self._by_vibration, self._spectrum = not model.slip_only, model.spectrum
+        self._by_vibration = not model.slip_only
         grounds = () if model.spectrum is None else model.spectrum.grounds
         self._grounds = np.array([classes.index(name) for name in grounds], dtype=int)
 
-    def of_window(self, window: Window) -> Array:
+    def of_window(self, window: Window, log_odds: Array | None) -> Array:
         """Tempered log-likelihoods (k,) of a window, known up to a constant.
 
-        With a classifier of the spectrum, the densities of the vibration tell whether the ground is one of
-        those it knows, the classifier which of these: p(x | c) = P(c | spectrum) sum of p(x | known).
+        Given `log_odds` of the spectrum, the densities of the vibration tell whether the ground is one of
+        those with a density, the spectrum which of these: p(x | c) = P(c | spectrum) sum of p(x | known).
         """
         values, variances = extract(window, self._by_vibration)
-        shares = None if self._spectrum is None else self._spectrum.log_probabilities(band_levels(window))
-        if shares is None:
+        if log_odds is None:
             return self.evaluate(values, variances)
         is_slip = np.arange(len(FEATURES)) >= SLIP
         vibration = self._log_densities(np.where(is_slip, np.nan, values), variances)
-        vibration[self._grounds] = np.logaddexp.reduce(vibration[self._grounds]) + shares
+        known = np.logaddexp.reduce(vibration[self._grounds])
+        vibration[self._grounds] = known + log_probabilities(log_odds)
         slips = self._log_densities(np.where(is_slip, values, np.nan), variances)
         return np.asarray((vibration + slips) / self._temperature)
 
@@ -254,11 +254,8 @@ def _problems(content: TerrainModelFile) -> Iterator[tuple[str, str]]:
         )
     if not content.classes or UNKNOWN in content.classes:
         yield "'classes' must map class names to mixtures, without 'unknown'", again
-    spectrum = content.spectrum
-    if spectrum is not None and not set(spectrum.weights) == set(spectrum.offsets) == set(content.classes):
-        yield "'spectrum' has not the grounds of 'classes'", again
-    if spectrum is not None and not min(spectrum.scale) > 0.0:
-        yield "'spectrum.scale' must be positive", again
+    if content.spectrum is not None:
+        yield from ((what, again) for what in content.spectrum.problems(set(content.classes)))
     densities = {f"classes.{name}": parts for name, parts in content.classes.items()}
     for key, parts in (densities | {UNKNOWN: content.unknown}).items():
         if not parts:

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.fusion.terrain.change_alarm import ChangeAlarm
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
 from terrafusion.fusion.terrain.credit import SourceCredit
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
@@ -41,7 +42,9 @@ class TerrainDetector:
                 remedy="mend the policy",
             )
         self.classes = classes
-        self._table = LikelihoodTable(model, classes)
+        self._table, self._spectrum = LikelihoodTable(model, classes), model.spectrum
+        self._alarm = None if model.spectrum is None else ChangeAlarm(model.spectrum.alarm)
+        self._temperature = model.temperature
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
         self.credit = SourceCredit(self._filter.prior, classes.index(UNKNOWN))
 
@@ -55,8 +58,14 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            evidence = self._table.of_window(window)
+            log_odds = None if self._spectrum is None else self._spectrum.log_odds(window)
+            evidence = self._table.of_window(window, log_odds)
             self.credit.check(evidence)
+            if self._alarm is not None and log_odds is not None:
+                if self._alarm.raised(log_odds):
+                    self._filter.forget()
+                if self._alarm.on_new_ground:
+                    evidence = evidence * self._temperature
             self._filter.update(evidence)
         return self.probabilities
 

@@ -32,6 +32,10 @@ class PatchFilter:
             self._set(self.probabilities * (1.0 - drawn) + self.prior * drawn)
         return self.probabilities
 
+    def forget(self) -> None:
+        """Begin a new patch, of which nothing is known."""
+        self.probabilities = self.prior.copy()
+
     def update(self, log_likelihood: ArrayLike) -> Array:
         """Weight the classes by log-evidence (k,), known up to a constant; NaN or +inf count as none."""
         evidence = np.asarray(log_likelihood, dtype=float)

@@ -5,6 +5,7 @@ axis of gyro and accelerometer. How these differ depends on the robot and its IM
 trained on labelled logs of the robot itself, and holds for no other.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Self
 
@@ -45,12 +46,23 @@ def band_levels(window: Window) -> Array:
 
 @dataclass(frozen=True)
 class SpectrumFile:
-    """Keys of the classifier in a terrain model file; weights and offsets by ground."""
+    """Keys of the classifier in a terrain model file; weights, offsets and rows of the alarm by ground."""
 
     mean: _Levels
     scale: _Levels
     weights: dict[str, _Levels]
     offsets: dict[str, float]
+    alarm: dict[str, tuple[float, ...]]
+
+    def problems(self, grounds: set[str]) -> Iterator[str]:
+        """What is wrong beyond single values, in a model of these grounds."""
+        for name in ("weights", "offsets", "alarm"):
+            if set(getattr(self, name)) != grounds:
+                yield f"'spectrum.{name}' has not the grounds of 'classes'"
+        if any(len(row) != len(self.alarm) for row in self.alarm.values()):
+            yield "'spectrum.alarm' is not square"
+        if not min(self.scale) > 0.0:
+            yield "'spectrum.scale' must be positive"
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +73,7 @@ class SpectrumClassifier:
         grounds: (k,) names.
         mean, scale: (42,) of the levels in training.
         weights, offsets: (k, 42), (k,).
+        alarm: (k, k) precision of `ChangeAlarm`; zeros raise none.
     """
 
     grounds: tuple[str, ...]
@@ -68,23 +81,30 @@ class SpectrumClassifier:
     scale: Array
     weights: Array
     offsets: Array
+    alarm: Array
 
     @classmethod
     def of_file(cls, content: SpectrumFile) -> Self:
         """The classifier of a model file."""
         grounds = tuple(content.weights)
-        weights = np.array([content.weights[name] for name in grounds])
-        offsets = np.array([content.offsets[name] for name in grounds])
-        return cls(grounds, np.array(content.mean), np.array(content.scale), weights, offsets)
+        mean, scale = np.array(content.mean), np.array(content.scale)
+        rows = (content.weights, content.offsets, content.alarm)
+        return cls(grounds, mean, scale, *(np.array([by[name] for name in grounds]) for by in rows))
 
     def standardised(self, levels: Array) -> Array:
         """Levels (..., 42) less their mean, over their scale; 0 where unknown."""
         return np.nan_to_num((levels - self.mean) / self.scale)
 
-    def log_probabilities(self, levels: Array) -> Array | None:
-        """log P(ground | levels) (k,); None where no level is known."""
+    def log_odds(self, window: Window) -> Array | None:
+        """Log-odds (k,) of the grounds against their geometric mean; None where no level is known."""
+        levels = band_levels(window)
         if not np.isfinite(levels).any():
             return None
         logits = self.weights @ self.standardised(levels) + self.offsets
-        p = np.exp(logits - logits.max())
-        return np.asarray(np.log(FLOOR + (1.0 - len(p) * FLOOR) * p / p.sum()))
+        return np.asarray(logits - logits.mean())
+
+
+def log_probabilities(log_odds: Array) -> Array:
+    """log P(ground | window) (k,) of log-odds (k,)."""
+    p = np.exp(log_odds - log_odds.max())
+    return np.asarray(np.log(FLOOR + (1.0 - len(p) * FLOOR) * p / p.sum()))

@@ -22,6 +22,7 @@ MAX_PATCH_WINDOWS = 80
 SETTLING_S = 3.0
 """Driving after a change of ground in which a switch of the detector does not count as false."""
 MIN_SCORED_PATCH_S = 5.0
+IN_TIME_S = 2.0
 Run = TypeVar("Run")
 
 
@@ -43,13 +44,16 @@ class DetectorScores(ClassificationScores):
     Attributes:
         unknown_share: share of windows classified as unknown.
         switch_delay_s: median, 95th percentile and largest time from a change of ground to its detection.
-        switches_missed: share of patches (of `MIN_SCORED_PATCH_S` and more) whose ground was never detected.
+        switches_in_time: share of patches (of `MIN_SCORED_PATCH_S` and more) whose ground was detected within
+            `IN_TIME_S`; NaN without a change.
+        switches_missed: share of them whose ground was never detected.
         false_switches_per_min: switches without a change of ground, per minute of driving.
         update_ms: mean processor time of one update.
     """
 
     unknown_share: float
     switch_delay_s: tuple[float, float, float]
+    switches_in_time: float
     switches_missed: float
     false_switches_per_min: float
     update_ms: float
@@ -121,11 +125,13 @@ def evaluate_each(trials: Sequence[tuple[TerrainModel, LabelledRoute]]) -> Detec
     winner = np.concatenate(winners)
     scores = classification_scores(classes, np.concatenate(truths), winner, np.concatenate(confidences))
     quantiles = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
+    in_time, changes = sum(delay <= IN_TIME_S for delay in delays), len(delays) + missed
     return DetectorScores(
         **vars(scores),
         unknown_share=float((winner == len(classes) - 1).mean()),
         switch_delay_s=(float(quantiles[0]), float(quantiles[1]), float(quantiles[2])),
-        switches_missed=missed / max(len(delays) + missed, 1),
+        switches_in_time=in_time / changes if changes else float("nan"),
+        switches_missed=missed / max(changes, 1),
         false_switches_per_min=false / max(scores.windows * UPDATE_S / 60.0, 1e-9),
         update_ms=1e3 * seconds / max(updates, 1.0),
     )

@@ -1,14 +1,20 @@
 """The classifier of a robot's grounds by the spectrum of their vibration, from labelled windows."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.terrain.change_alarm import LEAST, OVERLAP, last_difference
+from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.terrain.spectrum import SpectrumClassifier
 
 STRENGTH = 0.1
 """Inverse of the L2 penalty on the weights of standardised levels."""
+FALSE_ALARMS = 1.0 / 120.0
+"""Share of windows on one ground that may raise the alarm of a change: one a minute, of two a second."""
+_LEAST_WINDOWS = 120
+_SHRINK = 1e-3
 
 
 def fit_spectrum(levels: Mapping[str, Array]) -> SpectrumClassifier | None:
@@ -38,4 +44,24 @@ def fit_spectrum(levels: Mapping[str, Array]) -> SpectrumClassifier | None:
     weights, offsets = fit.coef_, fit.intercept_
     if len(grounds) == 2:  # scikit-learn then has the one of the second against the first
         weights, offsets = np.vstack([-weights, weights]) / 2.0, np.append(-offsets, offsets) / 2.0
-    return SpectrumClassifier(grounds, mean, scale, weights, offsets)
+    silent = np.zeros((len(grounds), len(grounds)))
+    return SpectrumClassifier(grounds, mean, scale, weights, offsets, silent)
+
+
+def alarm_precision(classifier: SpectrumClassifier, stretches: Iterable[Sequence[Window]]) -> Array:
+    """Precision (k, k) of `ChangeAlarm`, from stretches on one ground that the classifier was not fitted to.
+
+    Zeros, which raise no alarm, where the stretches are too short to know the share of false ones.
+    """
+    k = len(classifier.grounds)
+    found = []
+    for windows in stretches:
+        odds = [one for one in map(classifier.log_odds, windows) if one is not None]
+        found += [last_difference(np.array(odds[: i + 1])) for i in range(LEAST + OVERLAP, len(odds))]
+    if len(found) < _LEAST_WINDOWS:
+        return np.zeros((k, k))
+    apart = np.array(found)
+    scatter = np.cov(apart.T)
+    precision = np.linalg.pinv(scatter + _SHRINK * np.trace(scatter) / k * np.eye(k))
+    square = np.einsum("ni,ij,nj->n", apart, precision, apart)
+    return np.asarray(precision / np.quantile(square, 1.0 - FALSE_ALARMS))

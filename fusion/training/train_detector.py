@@ -187,9 +187,13 @@ def calibrate(model: TerrainModel, route: LabelledRoute) -> TerrainModel:
 def _evidence(model: TerrainModel, route: LabelledRoute) -> list[tuple[float, Array, int]]:
     """Distance driven, untempered log-likelihoods (k,) and true class of every moving window."""
     classes = (*model.classes, UNKNOWN)
-    table = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes)
+    table, spectrum = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes), model.spectrum
     return [
-        (w.ground_speed_mps() * w.dt_s, table.of_window(w), classes.index(str(label)))
+        (
+            w.ground_speed_mps() * w.dt_s,
+            table.of_window(w, None if spectrum is None else spectrum.log_odds(w)),
+            classes.index(str(label)),
+        )
         for w, label in zip(route.windows, route.labels, strict=True)
         if w.ground_speed_mps() > MIN_SPEED_MPS
     ]
@@ -274,15 +278,15 @@ def _digits(x: Any) -> Any:
 
 
 def _spectrum(classifier: SpectrumClassifier) -> dict[str, Any]:
-    rows = zip(classifier.grounds, classifier.weights.tolist(), classifier.offsets.tolist(), strict=True)
-    weights, offsets = {}, {}
-    for name, row, offset in rows:
-        weights[name], offsets[name] = _digits(row), _digits(offset)
+    def by_ground(rows: Array) -> dict[str, Any]:
+        return dict(zip(classifier.grounds, _digits(rows.tolist()), strict=True))
+
     return {
         "mean": _digits(classifier.mean.tolist()),
         "scale": _digits(classifier.scale.tolist()),
-        "weights": weights,
-        "offsets": offsets,
+        "weights": by_ground(classifier.weights),
+        "offsets": by_ground(classifier.offsets),
+        "alarm": by_ground(classifier.alarm),
     }
 
 

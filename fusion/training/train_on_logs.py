@@ -1,7 +1,7 @@
 """Training of the terrain model on labelled logs of one robot, and its cross-validation by run.
 
-Temperature and weight of `unknown` are calibrated on runs that the densities were not fitted to, spliced to
-routes over several grounds.
+Temperature, weight of `unknown` and alarm of a change are calibrated on runs that the densities were not
+fitted to; for the first two they are spliced to routes over several grounds.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.terrain.spectrum import band_levels
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate_each, splice
 from terrafusion.fusion.training.logged_runs import LoggedRun
-from terrafusion.fusion.training.spectrum_fit import fit_spectrum
+from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectrum
 from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
 
 FOLDS = 5
@@ -38,16 +38,27 @@ def train_on(runs: Sequence[LoggedRun], inputs: dict[str, str], made_by: str = "
     half = assign_folds(runs, 2)
     part = _fitted([run for run, fold in zip(runs, half, strict=True) if fold == 0])
     held_out = [run for run, fold in zip(runs, half, strict=True) if fold == 1]
-    calibrated = calibrate(part, splice([piece for run in held_out for piece in pieces(run)], PATCHES, 0))
+    stretches = [piece for run in held_out for piece in pieces(run)]
+    calibrated = calibrate(part, splice(stretches, PATCHES, 0))
     model = _fitted(runs)
+    spectrum = model.spectrum
+    if spectrum is not None and part.spectrum is not None:
+        alarm = alarm_precision(part.spectrum, [windows for windows, _ in stretches])
+        spectrum = dataclasses.replace(spectrum, alarm=alarm)
     unknown = dataclasses.replace(model.unknown, log_weight=calibrated.unknown.log_weight)
     return dataclasses.replace(
-        model, unknown=unknown, temperature=calibrated.temperature, inputs=inputs, made_by=made_by
+        model,
+        unknown=unknown,
+        temperature=calibrated.temperature,
+        spectrum=spectrum,
+        inputs=inputs,
+        made_by=made_by,
     )
 
 
-def cross_validated(runs: Sequence[LoggedRun]) -> DetectorScores:
-    """Scores of every run by a model of the other folds.
+def cross_validated(runs: Sequence[LoggedRun]) -> tuple[DetectorScores, DetectorScores | None]:
+    """Scores of every run by a model of the other folds; and along routes over several grounds, spliced from
+    the runs of each fold: None where no fold has two grounds.
 
     Raises:
         DataError: as `train_on`, also where a fold leaves a ground with a single run.
@@ -55,10 +66,15 @@ def cross_validated(runs: Sequence[LoggedRun]) -> DetectorScores:
     check_runs(runs)
     fold_of = assign_folds(runs, FOLDS)
     tried: list[tuple[TerrainModel, LabelledRoute]] = []
+    spliced: list[tuple[TerrainModel, LabelledRoute]] = []
     for fold in sorted(set(fold_of)):
         model = train_on([run for run, f in zip(runs, fold_of, strict=True) if f != fold], {})
-        tried += [(model, run.route) for run, f in zip(runs, fold_of, strict=True) if f == fold]
-    return evaluate_each(tried)
+        held_out = [run for run, f in zip(runs, fold_of, strict=True) if f == fold]
+        tried += [(model, run.route) for run in held_out]
+        stretches = [piece for run in held_out for piece in pieces(run)]
+        if len({ground for _, ground in stretches}) > 1:
+            spliced.append((model, splice(stretches, PATCHES, fold)))
+    return evaluate_each(tried), evaluate_each(spliced) if spliced else None
 
 
 def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:

@@ -196,6 +196,8 @@ ESTIMATOR = (
             "macro_f1": r"macro-F1 ([\d.]+)",
             "ece": r"macro-F1 .*; ECE ([\d.]+)",
             "unknown": r"macro-F1 .*; unknown ([\d.]+)",
+            "in_time": r"ground change .*; within 2 s (\d+)%",
+            "delay_s": r"ground change detected after ([\d.]+) s",
         },
     ),
     Study(

@@ -7,6 +7,8 @@ BorealTC (Husky, an IMU and wheels, no fixes), by run in five folds: `terrafusio
 
 from __future__ import annotations
 
+import re
+
 from terrafusion.fusion.cli.terrain import score_lines
 from terrafusion.fusion.training.logged_runs import open_runs
 from terrafusion.fusion.training.train_on_logs import cross_validated
@@ -16,10 +18,11 @@ from tests.studies.field_runs import catalogued
 def main() -> int:
     """Train on four folds, score the fifth, for each fold; print."""
     runs = open_runs([name for name in catalogued() if name.startswith("borealtc/") and has_imu(name)])
-    scores = cross_validated(runs)
-    for line in score_lines(f"{len(runs)} runs", scores):
-        if not line.startswith(("ground change", "one update")):
-            print(line)
+    by_run, spliced = cross_validated(runs)
+    lines = score_lines(f"{len(runs)} runs", by_run)
+    if spliced is not None:
+        lines += score_lines("routes spliced from them", spliced)
+    print(*(re.sub("; one update .*", "", line) for line in lines), sep="\n")
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -67,9 +68,12 @@ def test_held_out_runs_are_told_apart(model: TerrainModel, runs: list[LoggedRun]
     assert tuple(model.classes) == tuple(sorted(SHAKES))
     assert model.vehicles == ("husky",)
     assert scores_on(model, [run for run in runs if run.name.endswith("5")]).macro_f1 > 0.95
-    scores = cross_validated(runs)
+    scores, spliced = cross_validated(runs)
     assert scores.windows == sum(len(run.route.windows) for run in runs)
     assert scores.macro_f1 > 0.95
+    assert math.isnan(scores.switches_in_time), "each run is on one ground"
+    assert spliced is not None
+    assert spliced.switches_in_time > 0.9
     fewer = train_on([run for run in runs if not run.name.startswith("lawn")], {})
     with pytest.raises(DataError, match="does not know lawn"):
         scores_on(fewer, runs)
