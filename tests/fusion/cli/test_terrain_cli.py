@@ -34,11 +34,12 @@ def test_a_missing_model_is_a_known_error(tmp_path: Path) -> None:
 def test_scores_are_printed_for_the_grounds_that_occurred(capsys: pytest.CaptureFixture[str]) -> None:
     confusion = ((0.9, 0.1, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     scores = DetectorScores(
-        ("mud", "ice", "unknown"), 0.9, 0.9, 0.01, confusion, 50, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2
+        ("mud", "ice", "unknown"), 0.9, 0.9, 0.01, confusion, 50, 0.0, (1.0, 1.5, 2.0), 1.0, 0.0, 0.1, 0.2
     )
     lines = terrain.score_lines("trial", scores)
     assert lines[0] == "trial: 50 windows"
     assert [line.split()[0] for line in lines[2:4]] == ["mud", "macro-F1"]
+    assert "within 2 s 100%" in lines[4]
     with terrain.progress("drives", 3) as tick:
         tick()
     assert capsys.readouterr().err == ""
