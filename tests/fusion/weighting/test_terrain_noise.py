@@ -173,6 +173,20 @@ def test_the_window_of_the_detector_is_that_of_the_last_second() -> None:
     assert (last.slip, last.slip_sigma) == (None, None)  # no fixes: the slip is what its prior says
 
 
+@pytest.mark.parametrize(("robot", "shakes_like_the_policy"), [("elevate", True), ("warthog", False)])
+def test_a_label_says_how_the_imu_shakes_of_the_robot_of_the_policy_alone(
+    robot: str, shakes_like_the_policy: bool
+) -> None:
+    """A Warthog on real asphalt was 3.05 m off after 30 s without fixes with the label, 0.52 m without."""
+    weights = noise_of(robot, labels=GroundLabels((0,), ("asphalt",)))
+    weights.begin(0)
+    asphalt, pooled = weights.policy.classes["asphalt"], noise_of(robot, mode="fixed").noise
+    shaken = noise_of("elevate").policy.classes["asphalt"] if shakes_like_the_policy else pooled
+    assert weights.noise.slip_mean == pytest.approx(asphalt.slip_mean)
+    assert weights.noise.gyro_axes() == pytest.approx(shaken.gyro_axes())
+    assert weights.noise.accel_inflation == pytest.approx(shaken.accel_inflation)
+
+
 def test_noise_begins_on_the_level() -> None:
     weights = noise_of("elevate")
     weights.begin(0)
