@@ -36,6 +36,9 @@ FOREIGN_UNKNOWN = 0.96
 SLIP_TEMPERATURE = 20.0
 """Windows per independent observation where slip alone is used: its estimate is correlated over about 10 s
 (`slip_time_s` of the policy's fixed noise, and receivers drift as slowly), windows come twice a second."""
+CLAIM_TEMPERATURE = 4.0
+"""The same where slip checks what another source claims: good fixes show a new slip after 2 s, and a claim
+given up in error leaves the robot with its own detector (assumed)."""
 _BROAD_SHARE = 0.1
 
 
@@ -65,6 +68,7 @@ class TerrainModel:
         vehicles: names of the vehicles whose vibration the model knows.
         slip_only: use the slip alone; see `for_vehicle`.
         spectrum: of a model of one robot's own logs: tells its grounds apart by their vibration.
+        claimed: densities by which the claims of another source are checked, where not `classes`.
         scores: held-out figures of the training.
         inputs: name -> SHA-256 of the files of logs that it was trained on.
     """
@@ -80,6 +84,7 @@ class TerrainModel:
     slip_only: bool = False
     spectrum: SpectrumClassifier | None = None
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
+    claimed: dict[str, Mixture] | None = None
 
     def for_vehicle(self, name: str | None) -> Self:
         """The model for a robot.
@@ -109,7 +114,14 @@ class TerrainModel:
             temperature=max(self.temperature, SLIP_TEMPERATURE),
             slip_only=True,
             spectrum=None,
+            claimed=widened,
         )
+
+    def of_claims(self) -> Self:
+        """The model by which the claims of another source are checked."""
+        if self.claimed is None:
+            return self
+        return dataclasses.replace(self, classes=self.claimed, temperature=CLAIM_TEMPERATURE)
 
     def prior(self, classes: tuple[str, ...]) -> Array:
         """Prior probabilities (k,) of the named classes."""

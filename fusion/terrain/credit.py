@@ -1,8 +1,8 @@
 """Credit of an external source of the ground: how far wheels and IMU bear out what it claims.
 
 The log-odds that the source tells the ground grow with each window by the Bayes factor of the claimed grounds
-against grounds drawn from the prior. Densities of grounds are those of the detector, so a robot that the
-terrain model does not know checks a claim by its slip alone, while fixes show it.
+against grounds drawn at random. A robot that the terrain model does not know checks a claim by its slip
+alone, while fixes show it.
 """
 
 import math
@@ -27,12 +27,12 @@ class SourceCredit:
     the start.
 
     Args:
-        prior: (k,) probabilities of the grounds.
+        k: number of grounds.
         unknown: index of ground without a class, a claim that cannot be checked.
     """
 
-    def __init__(self, prior: Array, unknown: int) -> None:
-        self._prior, self._unknown = prior, unknown
+    def __init__(self, k: int, unknown: int) -> None:
+        self._drawn, self._unknown = np.full(k, 1.0 / k), unknown
         self._odds = TRUSTED
         self._claims: deque[Array] = deque(maxlen=20)
         self._recent: deque[Array] = deque(maxlen=WINDOWS)
@@ -41,6 +41,11 @@ class SourceCredit:
     def value(self) -> float:
         """The share now."""
         return (1.0 + math.exp(-TRUSTED)) / (1.0 + math.exp(-self._odds))
+
+    @property
+    def has_claims(self) -> bool:
+        """Whether there are claims to check."""
+        return bool(self._claims)
 
     def claim(self, probabilities: Array) -> None:
         """What the source says now: probabilities (k,) that sum to one."""
@@ -57,6 +62,6 @@ class SourceCredit:
         checked = 1.0 - float(claimed[self._unknown])
         if not checked > 0.5:
             return
-        borne_out = float(claimed @ likelihood) / float(self._prior @ likelihood)
+        borne_out = float(claimed @ likelihood) / float(self._drawn @ likelihood)
         self._odds += max(math.log(max(borne_out, 1e-9)), -MOST_LOSS)
         self._odds = min(max(self._odds, LEAST), TRUSTED)

@@ -45,8 +45,9 @@ class TerrainDetector:
         self._table, self._spectrum = LikelihoodTable(model, classes), model.spectrum
         self._alarm = None if model.spectrum is None else ChangeAlarm(model.spectrum.alarm)
         self._temperature = model.temperature
+        self._claims = LikelihoodTable(model.of_claims(), classes)
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
-        self.credit = SourceCredit(self._filter.prior, classes.index(UNKNOWN))
+        self.credit = SourceCredit(len(classes), classes.index(UNKNOWN))
 
     @property
     def probabilities(self) -> Array:
@@ -59,8 +60,9 @@ class TerrainDetector:
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
             log_odds = None if self._spectrum is None else self._spectrum.log_odds(window)
+            if self.credit.has_claims:
+                self.credit.check(self._claims.of_window(window, log_odds))
             evidence = self._table.of_window(window, log_odds)
-            self.credit.check(evidence)
             if self._alarm is not None and log_odds is not None:
                 if self._alarm.raised(log_odds):
                     self._filter.forget()

@@ -205,7 +205,11 @@ ESTIMATOR = (
         "What do right and wrong labels of the ground cost, where wheels and IMU check them?",
         module("wrong_labels", "--out", OUT),
         6,
-        {name: rf"all, {name} labels over fixed: (.*)" for name in ("true", "shuffled", "adversarial")},
+        {name: rf"all, {name} labels over fixed: (.*)" for name in ("true", "shuffled", "adversarial")}
+        | {
+            f"unseen_{name}": rf"unseen, {name} labels over fixed: (.*)"
+            for name in ("true", "shuffled", "adversarial")
+        },
         spread=True,
     ),
     Study(
