@@ -32,7 +32,7 @@ class SlipModel:
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Slip (n,) and its sigma (n,) for features (n, d)."""
-        basis = _basis((x - self.mean) / self.scale)
+        basis = quadratic_basis((x - self.mean) / self.scale)
         sigma = np.exp(0.5 * np.clip(basis @ self.spread, -9.0, 1.0))
         return np.clip(basis @ self.slip, -1.0, 1.5), np.maximum(sigma, LEAST_SIGMA)
 
@@ -45,7 +45,7 @@ class SlipModel:
 def fit(x: Array, slip: Array, groups: Sequence[str]) -> SlipModel:
     """A model of windows (n, d); `groups` (n,) are left out in turn to find spread and interval widths."""
     mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
-    basis, group = _basis((x - mean) / scale), np.asarray(groups)
+    basis, group = quadratic_basis((x - mean) / scale), np.asarray(groups)
     names = np.unique(group)
     left_out = np.empty(len(slip))
     for name in names:
@@ -63,7 +63,8 @@ def fit(x: Array, slip: Array, groups: Sequence[str]) -> SlipModel:
     return SlipModel(mean, scale, _ridge(basis, slip), spread, (half, most))
 
 
-def _basis(z: Array) -> Array:
+def quadratic_basis(z: Array) -> Array:
+    """One, standardised features (n, d), and their products."""
     z = np.clip(z, -MOST, MOST)
     rows, columns = np.triu_indices(z.shape[1])
     return np.hstack([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns] / MOST])
