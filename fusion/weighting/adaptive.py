@@ -28,6 +28,8 @@ from terrafusion.fusion.weighting.weighting import NOTEWORTHY, NoiseInForce, Wei
 
 UPDATE_NS = 500_000_000
 WINDOW_NS = 1_000_000_000
+BELIEVED = 0.5
+"""Credit from which the label, and not the detector, is taken for the ground."""
 MOST_CHANGES = 1000
 """Records kept where nobody takes them: memory must not grow over days."""
 
@@ -63,7 +65,6 @@ class TerrainNoise:
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._claimed: Array | None = None
-        self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
         self._starts_pooled = model.slip_only
         learns = config.grounds is not None or (self.adaptive and self._starts_pooled)
@@ -161,7 +162,16 @@ class TerrainNoise:
 
     @property
     def _probabilities(self) -> Array:
-        return self.detector.probabilities if self._label_probabilities is None else self._label_probabilities
+        return self._with_label(self.detector.probabilities)
+
+    def _believes_label(self) -> bool:
+        return self._claimed is not None and self.detector.credit.value > BELIEVED
+
+    def _with_label(self, found: Array) -> Array:
+        """The label in place of the probabilities found (k,), as far as it has credit."""
+        if self._claimed is None:
+            return found
+        return np.asarray(self._claimed + (1.0 - self.detector.credit.value) * (found - self._claimed))
 
     def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Fuse the class probabilities of another source.
@@ -195,7 +205,6 @@ class TerrainNoise:
         self._next_ns = state.t_ns + UPDATE_NS
         self.window = window = self._window(state, imu, wheels, (state.t_ns - before_ns) * 1e-9)
         self.detector.update(window)
-        self._weigh_label()
         ahead = -1.0 if window.wheel_speed_mps < 0.0 else 1.0
         self._grade = ahead * float(quaternion_to_matrix(state.quaternion)[2, 0])
         if self.grounds is not None:
@@ -233,14 +242,8 @@ class TerrainNoise:
         if self._labels is not None:
             self._claimed = self._labels.probabilities(t_ns, self.detector.classes)
             self.detector.credit.claim(self._claimed)
-            self._source = "label"
-            self._weigh_label()
-
-    def _weigh_label(self) -> None:
-        """Believe the label as far as it has credit, beyond that the detector."""
-        if self._claimed is not None:
-            doubt = 1.0 - self.detector.credit.value
-            self._label_probabilities = self._claimed + doubt * (self.detector.probabilities - self._claimed)
+            if self._believes_label():
+                self._source = "label"
 
     def _window(self, state: State, imu: ImuStream, wheels: WheelStream, dt_s: float) -> Window:
         """The last second up to `state`, `dt_s` after the last update: slow wheels make rare keyframes."""
@@ -275,17 +278,17 @@ class TerrainNoise:
     def _shares(self) -> Array:
         """Weight of each class (k,): its probability.
 
-        For a robot that the terrain model does not know, a class counts as far as it is more likely than
-        not: until then the pooled noise holds, which was fitted to all grounds and includes the doubt
-        between them.
+        For a robot that the terrain model does not know, a class that the detector finds counts as far as
+        it is more likely than not: until then the pooled noise holds, which was fitted to all grounds and
+        includes the doubt between them.
         """
-        p = self._probabilities
-        if self._starts_pooled and self._label_probabilities is None:
+        p = self.detector.probabilities
+        if self._starts_pooled:
             p = np.maximum(2.0 * p - 1.0, 0.0)
             unknown = self.detector.classes.index(UNKNOWN)
             p[unknown] = 0.0
             p[unknown] = 1.0 - p.sum()
-        return p
+        return self._with_label(p)
 
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
@@ -310,7 +313,7 @@ class TerrainNoise:
         """The most probable ground: a class, by their probabilities (k,), or one that the robot has found."""
         best = int(p.argmax())
         found = self.grounds.memory if self.grounds and self._starts_pooled else GroundMemory()
-        own, by_label = found.most_probable(), self._label_probabilities is not None
+        own, by_label = found.most_probable(), self._believes_label()
         if own and not by_label and self.detector.classes[best] == UNKNOWN:
             return f"{own} p = {found.belief.max():.2f} (found while driving)"
         return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"

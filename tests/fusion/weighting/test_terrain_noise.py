@@ -187,6 +187,19 @@ def test_a_label_says_how_the_imu_shakes_of_the_robot_of_the_policy_alone(
     assert weights.noise.accel_inflation == pytest.approx(shaken.accel_inflation)
 
 
+@pytest.mark.parametrize("robot", ["elevate", "husky"])
+def test_a_label_without_credit_leaves_what_the_detector_makes_of_the_ground(robot: str) -> None:
+    """A class that is as likely as not has no weight on a robot that the model does not know."""
+    told, alone = noise_of(robot, labels=GroundLabels((0,), ("mud",))), noise_of(robot)
+    told.detector.credit._odds = -60.0
+    evidence = np.log([0.01, 0.01, 0.45, 0.01, 0.45]) - np.log(alone.detector.probabilities)
+    for weights in (told, alone):
+        weights.detector._filter.update(evidence)
+        weights.begin(0)
+    assert dataclasses.astuple(told.noise) == pytest.approx(dataclasses.astuple(alone.noise))
+    assert "(label)" not in told.take_changes()[0].reason
+
+
 def test_noise_begins_on_the_level() -> None:
     weights = noise_of("elevate")
     weights.begin(0)
