@@ -156,7 +156,10 @@ def test_ratios_are_to_the_best_opponent() -> None:
         Cell("set/log", 30.0, "fixed", "k", (3.0,), (30.0,)),
     ]
     assert [c.ratio for c in compared(cells, "fixed", "k")] == [1.5]
-    assert "fixed, k, 30 s: 1.50, lost 1 of 1" in markdown(cells, [], 0, 3)
+    page = markdown(cells, [], 0, 3)
+    assert "fixed, k, 30 s: 1.50, lost 1 of 1" in page
+    assert "EKF / best of the others and fixed, 30 s: 0.67, lost 0 of 1" in page
+    assert "EKF tuned / best of the others and fixed, 30 s: 1.50, lost 1 of 1" in page
     assert not compared(cells[1:], "fixed", "k")  # the best of some would flatter
 
 

@@ -110,6 +110,8 @@ ESTIMATOR = (
             "over_ekf": r"adaptive / EKF, vehicle of the log: ([\d.]+)",
             "over_ekf_interval": r"adaptive / EKF, vehicle of the log: ([\d.]+ \[[\d.]+, [\d.]+\])",
             "lost_to_ekf": r"adaptive / EKF, vehicle of the log: .*lost (\d+ of \d+)",
+            "ekf_tuned_by_this_rule": r"EKF tuned / best of the others and adaptive, 10 s: ([\d.]+)",
+            "ins_by_this_rule": r"INS / best of the others and adaptive, 10 s: ([\d.]+)",
         },
         "opponents.png",
         spread=True,
@@ -247,7 +249,8 @@ ESTIMATOR = (
             f"{fit.split()[0]}_{source}": rf"{fit} to {source} +\d+ runs: .* by window, ([\d.]+) by run"
             for source in ("norlab_drive", "borealtc")
             for fit in ("twin", "other robot", "both")
-        },
+        }
+        | {"borealtc_judged": r"twin to borealtc .*, (\d+ %) of the windows judged"},
     ),
     Study(
         "known_changes",

@@ -67,6 +67,10 @@ def markdown(cells: Sequence[Cell], failures: Sequence[str], missing: int, tasks
     lengths = sorted({c.seconds for c in cells})
     parts = [f"Ratio of median errors to the {BEST}, geometric mean over logs with 95 % interval:"]
     parts += [_line(cells, mode, known, seconds) for known in kinds for mode in MODES for seconds in lengths]
+    parts += ["", "The same rule for the opponents, each over the best of the others and a mode:"]
+    parts += [
+        line for mode in MODES for seconds in lengths for line in _others(cells, mode, kinds[:1], seconds)
+    ]
     parts += ["", "The same, to each opponent, all lengths:"]
     parts += [line for known in kinds for mode in MODES for line in _each(cells, mode, known)]
     for known in kinds:
@@ -88,6 +92,24 @@ def _each(cells: Sequence[Cell], mode: str, known: str) -> list[str]:
         if ratios:
             lost = f"lost {losses(ratios)} of {len(ratios)}"
             lines.append(f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, {lost}")
+    return lines
+
+
+def _others(cells: Sequence[Cell], mode: str, known: Sequence[str], seconds: float) -> list[str]:
+    """A line an opponent: its ratio to the best of all others, the mode among them."""
+    here = [c for c in cells if c.seconds == seconds and (c.estimator in OPPONENTS or c.known in known)]
+    medians: dict[str, dict[str, float]] = {}
+    for cell in here:
+        if cell.estimator in (mode, *OPPONENTS):
+            medians.setdefault(cell.log, {})[cell.estimator] = cell.median_m
+    logs = [m for m in medians.values() if len(m) == len(OPPONENTS) + 1]
+    lines = []
+    for name in OPPONENTS if logs else ():
+        ratios = [ratio(m[name], min(e for other, e in m.items() if other != name)) for m in logs]
+        lost = f"lost {losses(ratios)} of {len(ratios)}"
+        lines.append(
+            f"{name} / best of the others and {mode}, {seconds:g} s: {geometric_mean(ratios).text()}, {lost}"
+        )
     return lines
 
 
