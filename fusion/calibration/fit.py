@@ -27,8 +27,9 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
     information = np.linalg.inv(before.covariance)
     right = information @ (before.mean - now.mean)
     for one in reduced:
-        information = information + one.information
-        right = right + one.right
+        shown, pull = one.without_feigned()
+        information = information + shown
+        right = right + pull
     covariance = np.linalg.inv(information)
     found = dataclasses.replace(now, mean=now.mean + covariance @ right, covariance=covariance).outwards()
     moments = [one.apply(found.mean - now.mean, found.mean) for one in reduced]

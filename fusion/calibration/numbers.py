@@ -60,9 +60,28 @@ NO_LAG_SIGMA_S = 1e-3
 IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
+COMMON_DELAY_S, TURN_SLIP_M = 0.5, 0.25
+"""1 sigma of the two changes of `feigned_by_slip` (0.1 to 0.5 s, and 0.03 to 0.2 m, more on mud: clean drives
+of the twin below seed 50)."""
 CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01, 0.05]), 0.05
 """Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
 the turn scale where there is no gyro."""
+
+
+def feigned_by_slip(one_sided: float) -> Array:
+    """Changes (8, 2) of `NUMBERS` that slip feigns, of 1 sigma each, on robots that skid in turns.
+
+    Fixes and wheels that come later by as much as the course leads the heading leave the path as it is, to
+    first order of the delays: what is left is smaller than slip. Wheels that slip in a turn by a length for
+    each radian look, in turns to one side, like an antenna that is off to that side.
+
+    Args:
+        one_sided: turns to the left less those to the right over all turns, -1 to 1.
+    """
+    change = np.zeros((len(NUMBERS), 2))
+    change[[GNSS_DELAY, WHEEL_DELAY, COURSE_LAG], 0] = np.array([1.0, 1.0, -1.0]) * COMMON_DELAY_S
+    change[ANTENNA_Y, 1] = one_sided * TURN_SLIP_M
+    return change
 
 
 @dataclass(frozen=True, eq=False)

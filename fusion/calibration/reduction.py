@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.motion import Complex, MotionSegment, Path, dead_reckoned
-from terrafusion.fusion.calibration.numbers import ANTENNA_X, ANTENNA_Y, GNSS_DELAY, NUMBERS, WHEEL_SCALE
+from terrafusion.fusion.calibration.motion import LEAST_STEP_S, Complex, MotionSegment, Path, dead_reckoned
+from terrafusion.fusion.calibration.numbers import (
+    ANTENNA_X,
+    ANTENNA_Y,
+    GNSS_DELAY,
+    NUMBERS,
+    WHEEL_SCALE,
+    feigned_by_slip,
+)
 from terrafusion.fusion.calibration.slip import SlipMoments
 
 Places = NDArray[np.intp]
@@ -44,12 +51,14 @@ class Noise:
     Attributes:
         yaw_density_radps: white noise of the turn's source, rad/s/sqrt(Hz); turn_share: of a turn.
         drift_share: drifting share of a fix's variance; drift_time_s: its correlation time.
+        skids: whether wheels or tracks skid in every turn.
     """
 
     yaw_density_radps: float
     turn_share: float
     drift_share: float
     drift_time_s: float
+    skids: bool = False
 
 
 @dataclass(eq=False)
@@ -129,6 +138,15 @@ class Reduction:
             self._eliminate()
             return True
         return False
+
+    def without_feigned(self) -> tuple[Array, Array]:
+        """Information (8, 8) and right-hand side (8,) with the changes that slip feigns as unknowns."""
+        if not self.noise.skids:
+            return self.information, self.right
+        changes = feigned_by_slip(_one_sided(self.part.drive))
+        across = self.information @ changes
+        gain = across @ np.linalg.inv(np.eye(changes.shape[1]) + changes.T @ across)
+        return self.information - gain @ across.T, self.right - gain @ (changes.T @ self.right)
 
     def apply(self, step: Array, numbers: Array) -> SlipMoments:
         """Move the nodes by the step of the numbers; moments of the ratios about the wheel scale."""
@@ -293,6 +311,12 @@ class Reduction:
             start[0, 0, DRIFT_E] = start[0, 1, DRIFT_N] = 1.0 / sigma_m
             out.append((start, self.part.state[:1, DRIFT_E:] / sigma_m, every[:1], 1))
         return out
+
+
+def _one_sided(drive: MotionSegment) -> float:
+    """Turns to the left less those to the right over all turns, by the squares of their rates."""
+    squares = drive.turn_rad**2 / np.maximum(np.diff(drive.t_s), LEAST_STEP_S)
+    return float(np.sum(np.sign(drive.turn_rad) * squares) / max(float(np.sum(squares)), 1e-9))
 
 
 def _inflation(left: Array) -> float:

@@ -369,6 +369,7 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
         WHEEL_TURN_SHARE if wheels else 0.0,
         1.0 - WHITE_SHARE,
         max(sensors.gnss.correlation_time_s, 1.0),
+        config.rig.drive in SKIDDING,
     )
     antenna_m = complex(*sensors.gnss.antenna_m[:2]) + config.rig.ahead_m
     return SelfCalibration(prior, noise, antenna_m)

@@ -14,13 +14,16 @@ from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
+    COMMON_DELAY_S,
     COURSE_LAG,
     GNSS_DELAY,
     NUMBERS,
     TURN_SCALE,
+    TURN_SLIP_M,
     WHEEL_DELAY,
     WHEEL_SCALE,
     assumed,
+    feigned_by_slip,
 )
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 from tests.fusion.calibration.nodes import fit, node_starts, refined
@@ -150,6 +153,31 @@ def test_wheels_that_slip_while_they_accelerate_are_ahead_by_a_time() -> None:
     found = fit([drive], [(0j, 0.0)], assumed(0.005, False, 0.03, 300.0, skids=True), NOISE)
     for number in (GNSS_DELAY, WHEEL_DELAY):
         assert abs(found.mean[number] - slipping[number]) < 2.0 * found.sigma[number]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_changes_that_slip_feigns_widen_what_a_drive_shows(side: float) -> None:
+    """They are added to the covariance of the numbers, of robots that skid."""
+    drive = figure(60.0)
+    drive = dataclasses.replace(drive, turn_rad=side * np.abs(drive.turn_rad))
+    part = Reduction.of(started(drive, 0j, 0.0, TRUE), TRUE, 0.03, dataclasses.replace(NOISE, skids=True))
+    root = np.random.default_rng(0).normal(size=(len(NUMBERS), len(NUMBERS)))
+    part.information = root @ root.T
+    changes = feigned_by_slip(side)
+    wider = np.linalg.inv(part.information) + changes @ changes.T
+    assert np.allclose(np.linalg.inv(part.without_feigned()[0]), wider)
+    assert changes[ANTENNA_Y, 1] == side * TURN_SLIP_M
+    rolling = dataclasses.replace(part, noise=NOISE)
+    assert rolling.without_feigned()[0] is rolling.information
+
+
+def test_what_slip_feigns_depends_on_turns_to_one_side() -> None:
+    assert feigned_by_slip(0.0)[ANTENNA_Y].tolist() == [0.0, 0.0]
+    assert feigned_by_slip(0.0)[[GNSS_DELAY, WHEEL_DELAY, COURSE_LAG], 0].tolist() == [
+        COMMON_DELAY_S,
+        COMMON_DELAY_S,
+        -COMMON_DELAY_S,
+    ]
 
 
 def test_a_course_that_leads_is_none_that_lags() -> None:
