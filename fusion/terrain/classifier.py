@@ -67,6 +67,8 @@ class TerrainModel:
         patch_length_m: expected distance between two changes of ground.
         vehicles: names of the vehicles whose vibration the model knows.
         slip_only: use the slip alone; see `for_vehicle`.
+        doubt: share of the probabilities that is spread evenly: a ground that looks like another may do so
+            for a whole run, which more windows do not average out.
         spectrum: of a model of one robot's own logs: tells its grounds apart by their vibration.
         claimed: densities by which the claims of another source are checked, where not `classes`.
         scores: held-out figures of the training.
@@ -82,6 +84,7 @@ class TerrainModel:
     made_by: str = ""
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
     slip_only: bool = False
+    doubt: float = 0.0
     spectrum: SpectrumClassifier | None = None
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
     claimed: dict[str, Mixture] | None = None
@@ -113,6 +116,7 @@ class TerrainModel:
             unknown=unknown,
             temperature=max(self.temperature, SLIP_TEMPERATURE),
             slip_only=True,
+            doubt=0.0,
             spectrum=None,
             claimed=widened,
         )
@@ -223,6 +227,7 @@ class TerrainModelFile:
     classes: dict[str, tuple[ComponentFile, ...]]
     unknown: tuple[ComponentFile, ...]
     scores: dict[str, Any]
+    doubt: Annotated[float, Quantity("", 0.0, 0.99)] = 0.0
     spectrum: SpectrumFile | None = None
     inputs: dict[str, str] = dataclasses.field(default_factory=dict)
 
@@ -252,6 +257,7 @@ def load_terrain_model(path: Path | None = None) -> TerrainModel:
         inputs_sha256=content.inputs_sha256,
         made_by=content.made_by,
         scores=content.scores,
+        doubt=content.doubt,
         spectrum=None if content.spectrum is None else SpectrumClassifier.of_file(content.spectrum),
         inputs=content.inputs,
     )

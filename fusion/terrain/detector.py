@@ -44,7 +44,7 @@ class TerrainDetector:
         self.classes = classes
         self._table, self._spectrum = LikelihoodTable(model, classes), model.spectrum
         self._alarm = None if model.spectrum is None else ChangeAlarm(model.spectrum.alarm)
-        self._temperature = model.temperature
+        self._temperature, self._doubt = model.temperature, model.doubt
         self._claims = LikelihoodTable(model.of_claims(), classes)
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
         self.credit = SourceCredit(len(classes), classes.index(UNKNOWN))
@@ -52,7 +52,8 @@ class TerrainDetector:
     @property
     def probabilities(self) -> Array:
         """The present class probabilities (k,), a copy."""
-        return self._filter.probabilities.copy()
+        found = self._filter.probabilities
+        return np.asarray((1.0 - self._doubt) * found + self._doubt / len(found))
 
     def update(self, window: Window) -> Array:
         """Class probabilities (k,) after one more window; unchanged while the robot stands."""

@@ -267,6 +267,7 @@ def write_model(model: TerrainModel, path: Path) -> None:
         "classes": {name: _listed(mixture) for name, mixture in model.classes.items()},
         "unknown": _listed(model.unknown),
         "scores": model.scores,
+        **({"doubt": model.doubt} if model.doubt else {}),
         **({} if model.spectrum is None else {"spectrum": _spectrum(model.spectrum)}),
         **({"inputs": model.inputs} if model.inputs else {}),
     }

@@ -1,7 +1,7 @@
 """Training of the terrain model on labelled logs of one robot, and its cross-validation by run.
 
-Temperature, weight of `unknown` and alarm of a change are calibrated on runs that the densities were not
-fitted to; for the first two they are spliced to routes over several grounds.
+Temperature, weight of `unknown`, doubt and alarm of a change are calibrated on runs that the densities were
+not fitted to; for the first two they are spliced to routes over several grounds.
 """
 
 import dataclasses
@@ -12,7 +12,8 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.terrain.classifier import TerrainModel
+from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
+from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.terrain.spectrum import band_levels
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate_each, splice
@@ -21,6 +22,7 @@ from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectr
 from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
 
 FOLDS = 5
+DOUBTS = (0.0, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.25, 0.35)
 MIN_RUNS = 2
 """Of a ground: one to fit to, one to calibrate or to test on."""
 
@@ -39,21 +41,40 @@ def train_on(runs: Sequence[LoggedRun], inputs: dict[str, str], made_by: str = "
     part = _fitted([run for run, fold in zip(runs, half, strict=True) if fold == 0])
     held_out = [run for run, fold in zip(runs, half, strict=True) if fold == 1]
     stretches = [piece for run in held_out for piece in pieces(run)]
-    calibrated = calibrate(part, splice(stretches, PATCHES, 0))
+    part = _with_alarm(calibrate(part, splice(stretches, PATCHES, 0)), stretches)
     model = _fitted(runs)
     spectrum = model.spectrum
     if spectrum is not None and part.spectrum is not None:
-        alarm = alarm_precision(part.spectrum, [windows for windows, _ in stretches])
-        spectrum = dataclasses.replace(spectrum, alarm=alarm)
-    unknown = dataclasses.replace(model.unknown, log_weight=calibrated.unknown.log_weight)
+        spectrum = dataclasses.replace(spectrum, alarm=part.spectrum.alarm)
     return dataclasses.replace(
         model,
-        unknown=unknown,
-        temperature=calibrated.temperature,
+        unknown=dataclasses.replace(model.unknown, log_weight=part.unknown.log_weight),
+        temperature=part.temperature,
+        doubt=_doubt(part, held_out),
         spectrum=spectrum,
         inputs=inputs,
         made_by=made_by,
     )
+
+
+def _with_alarm(model: TerrainModel, stretches: Sequence[tuple[list[Window], str]]) -> TerrainModel:
+    """The model with the alarm of a change, by stretches that it was not fitted to."""
+    spectrum = model.spectrum
+    if spectrum is not None:
+        alarm = alarm_precision(spectrum, [windows for windows, _ in stretches])
+        spectrum = dataclasses.replace(spectrum, alarm=alarm)
+    return dataclasses.replace(model, spectrum=spectrum)
+
+
+def _doubt(model: TerrainModel, runs: Sequence[LoggedRun]) -> float:
+    """The doubt of a model by which runs that it was not fitted to are most likely."""
+    classes, true = (*model.classes, UNKNOWN), list[float]()
+    for run in runs:
+        detector = TerrainDetector(model, classes)
+        for window, ground in zip(run.route.windows, run.route.labels, strict=True):
+            true.append(float(detector.update(window)[classes.index(str(ground))]))
+    p = np.array(true)
+    return max(DOUBTS, key=lambda doubt: float(np.log((1.0 - doubt) * p + doubt / len(classes)).sum()))
 
 
 def cross_validated(runs: Sequence[LoggedRun]) -> tuple[DetectorScores, DetectorScores | None]:

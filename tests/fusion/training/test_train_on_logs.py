@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from terrafusion.fusion.cli import main, terrain
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
+from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.training.detector_scores import changes_in
 from terrafusion.fusion.training.logged_runs import LoggedRun
@@ -84,6 +86,21 @@ def test_slip_that_the_logs_do_not_show_tells_nothing(model: TerrainModel) -> No
     slip = [(float(m.mean[0, 5]), float(m.covariance[0, 5, 5])) for m in model.classes.values()]
     assert slip == [pytest.approx(slip[0])] * len(slip)
     assert slip[0][1] > 0.5
+
+
+def test_a_run_whose_ground_looks_like_another_leaves_doubt(runs: list[LoggedRun]) -> None:
+    """One lawn in three shakes like pavement: no posterior is surer than that."""
+    deceiving = [
+        dataclasses.replace(run, route=changes_in(run.route.windows, np.full(len(run.route.labels), "lawn")))
+        for run in (made_run(["pavement"], 70 + n) for n in range(3))
+    ]
+    assert train_on(runs, {}).doubt <= 0.02
+    doubting = train_on([*runs, *deceiving], {})
+    assert doubting.doubt >= 0.05
+    detector = TerrainDetector(doubting, (*doubting.classes, "unknown"))
+    for window in made_run(["gravel"], 90).route.windows:
+        sure = float(detector.update(window).max())
+    assert sure <= 1.0 - 0.75 * doubting.doubt
 
 
 def test_a_run_over_several_grounds_counts_for_each() -> None:
