@@ -180,20 +180,40 @@ class Rig:
 UP_FACTOR = 2.0
 
 
-def with_assumed_sigma(rig: Rig | None, sigma: Array, fix: NDArray[np.uint8]) -> tuple[Array, list[str]]:
-    """Sigmas (N, 3) with the unknown and the non-positive ones filled, and a note where any was."""
+def with_assumed_sigma(
+    rig: Rig | None, sigma: Array, fix: NDArray[np.uint8], every: NDArray[np.uint8] | None = None
+) -> tuple[Array, list[str]]:
+    """Sigmas (N, 3) with the unknown and the non-positive ones filled, and a note where any was.
+
+    The vehicle's sigma is that of the best class of fix in the log; a poorer one has at least the sigma
+    `ASSUMED_SIGMA_M` of its class.
+
+    Args:
+        fix: (N,) classes.
+        every: classes of all fixes of the log, where `fix` are some of them.
+    """
     unknown = ~(sigma > 0.0)
     if not unknown[:, :2].any():
         sigma = np.where(unknown, np.nan, sigma)
         return sigma, []
     filled = int(unknown[:, :2].any(axis=1).sum())
-    spec = rig.sensors.gnss if rig else None
+    spec, flat = rig.sensors.gnss if rig else None, CLASS_SIGMA_M[fix]
     if spec is not None:
-        assumed = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
+        poorer = flat > CLASS_SIGMA_M[fix if every is None else every].min()
+        own = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
+        assumed = np.where(poorer[:, None], np.maximum(_by_class(flat), own), own)
         origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"
+        if poorer.any():
+            origin += f", and by class: {_classes(fix[poorer])}"
     else:
-        flat = CLASS_SIGMA_M[fix]
-        assumed = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
-        used = ", ".join(f"{Fix(k).name.lower()} {ASSUMED_SIGMA_M[Fix(k)]:g} m" for k in np.unique(fix))
-        origin = f"assumed by class, flat: {used}"
+        assumed = _by_class(flat)
+        origin = f"assumed by class, flat: {_classes(fix)}"
     return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes have no sigma; taken from {origin}"]
+
+
+def _by_class(flat: Array) -> Array:
+    return np.stack([flat, flat, UP_FACTOR * flat], axis=1)
+
+
+def _classes(fix: NDArray[np.uint8]) -> str:
+    return ", ".join(f"{Fix(k).name.lower()} {ASSUMED_SIGMA_M[Fix(k)]:g} m" for k in np.unique(fix))

@@ -321,7 +321,7 @@ class ChannelReader:
         lacking &= fix > Fix.NONE
         if self.meta.keep_empty or not lacking.any():
             return sigma
-        filled, notes = with_assumed_sigma(self.rig, sigma[lacking], fix[lacking])
+        filled, notes = with_assumed_sigma(self.rig, sigma[lacking], fix[lacking], fix)
         self.notes += notes
         sigma[lacking] = filled
         return sigma
