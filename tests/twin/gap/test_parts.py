@@ -296,7 +296,7 @@ def test_what_a_vehicle_is_built_like_is_in_its_twin_and_no_cause() -> None:
     recording = dataclasses.replace(simulate(DRIVE, vehicle=husky, seed=1), truth=None, truth_channels=())
     (log,), model, _ = prepared([recording], husky, None)
     for group in (*effect_groups(candidates), ()):
-        (lane,) = make_lanes([(log, {}, log.start)], model, candidates, group)
+        (lane,) = make_lanes([(log, model, {}, log.start)], candidates, group)
         assert lane.plant.effects.items() >= husky.effects.items()
     sensors = SampledSensors(log, model, candidates, log.samples())
     assert {*sensors._graph_effects({}, ())} >= husky.effects.keys()

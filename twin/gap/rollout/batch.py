@@ -114,20 +114,20 @@ class Lane:
 
 
 def make_lanes(
-    runs: Sequence[tuple[PreparedLog, Effects, Array]],
-    model: Model,
+    runs: Sequence[tuple[PreparedLog, Model, Effects, Array]],
     candidates: Candidates,
     group: Sequence[str],
 ) -> list[Lane]:
-    """Lanes of (log, effects, poses (W, 3)); effects of the group, of the soil and those of the model that
-    are no candidates are in the graph. Lanes with equal inputs share the array."""
+    """Lanes of (log, model, effects, poses (W, 3)); effects of the group, of the soil and those of the model
+    that are no candidates are in the graph. Lanes with equal inputs share the array."""
     scales = dict(zip(candidates.keys, candidates.scale, strict=True))
-    dead_time, others = VEHICLE_PARAMETERS.index("dead_time_applied_s"), other_effects(model, candidates)
-    bases, inputs, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
-    for log, effects, start in runs:
-        if id(log) not in bases:
-            bases[id(log)] = plant_of(log, dataclasses.replace(model, effects=others))
-        base = bases[id(log)]
+    dead_time = VEHICLE_PARAMETERS.index("dead_time_applied_s")
+    bases, inputs, out = dict[tuple[int, int], Plant](), dict[tuple[int, float], Array](), list[Lane]()
+    for log, model, effects, start in runs:
+        if (id(log), id(model)) not in bases:
+            others = other_effects(model, candidates)
+            bases[id(log), id(model)] = plant_of(log, dataclasses.replace(model, effects=others))
+        base = bases[id(log), id(model)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
         named = {*group, *SOIL_KEYS, *effects} & {*candidates.moving}

@@ -32,6 +32,7 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     moved_to,
 )
 from terrafusion.twin.gap.rollout.shared_errors import gains_of, with_shared, without_shared
+from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 
 SOIL_SIGMAS = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
@@ -213,9 +214,11 @@ class LinearisationCache:
         """Hash of what logs that share a linearisation have in common."""
         sector = np.round(log.start[:1, 2] / SAME_YAW_RAD) + 0.0  # no negative zero
         key = hashlib.sha256(sector.tobytes())
-        for part in (log.sides, log.windows, log.borders):
+        model = self.model
+        numbers = [model.vehicle_vector(), *(soil_vector(soil) for soil in model.soils.values())]
+        for part in (log.sides, log.windows, log.borders, *numbers):
             key.update(np.ascontiguousarray(part).tobytes())
-        key.update(repr((log.labels, self.candidates.keys, sorted(self.model.effects.items()))).encode())
+        key.update(repr((log.labels, self.candidates.keys, sorted(model.effects.items()))).encode())
         return key.hexdigest()
 
     def of(self, log: PreparedLog) -> Linearisation:

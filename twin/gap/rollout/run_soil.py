@@ -37,99 +37,58 @@ SHORTER, LEAST_STEP = 0.4, 0.1
 """Factor by which a step that did not reduce the errors is shortened, and the least share of a full step that
 is tried. A full step overshoots where slip grows steeply; without shorter ones the run would keep the
 references' soil."""
-ALONE = (1.0, 0.3)
-"""1 sigma of a step of one run's soil and of the effects beside it, in typical sizes (assumed)."""
+SOIL_SIGMA, EFFECT_SIGMA = 1.0, 0.3
+"""1 sigma of a step of the soil and of the effects beside it, in typical sizes (assumed)."""
 
 
 @dataclass(eq=False)
 class SoilSearch:
-    """Search for the soil (S,) that runs share, in typical sizes from the model's.
+    """Search for the soil (S,) of a run, in typical sizes from the model's.
 
     Attributes:
-        runs: each about the model's soil.
-        errors, white_errors: of each on the soil found so far, before and after whitening.
-        soil_sigma, effect_sigma: 1 sigma of a step of the soil, and of the effects beside it.
+        run: about the model's soil.
+        error, white_error: on the soil found so far, before and after whitening.
         share: of a full step.
         going: whether another step is tried.
     """
 
-    runs: Sequence[WhitenedRun]
+    run: WhitenedRun
     soil: Array
-    errors: Sequence[Sequence[Array]]
-    white_errors: Sequence[Array]
-    soil_sigma: float
-    effect_sigma: float
+    error: Sequence[Array]
+    white_error: Array
     share: float = 1.0
     going: bool = True
 
     @classmethod
-    def of(
-        cls, runs: Sequence[RunResiduals], noise: Mapping[str, ResidualNoise], sigmas: tuple[float, float]
-    ) -> Self:
-        """From the model's soil on; `sigmas` of a step and of the effects."""
-        white = [whitened(run.without_nuisance(), noise) for run in runs]
-        return cls(white, runs[0].soil, [run.error for run in runs], [w.error for w in white], *sigmas)
+    def of(cls, run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> Self:
+        """From the model's soil on."""
+        white = whitened(run.without_nuisance(), noise)
+        return cls(white, run.soil, run.error, white.error)
 
     def step(self, candidates: Candidates) -> Array:
-        """Step (S,) of the soil; effects and the sensor states of each run take part as nuisances."""
-        S, T, K = len(self.soil), self.runs[0].states, len(candidates.keys)
+        """Step (S,) of the soil; effects and sensor states take part as nuisances."""
+        S, T, K = len(self.soil), self.run.states, len(candidates.keys)
         others = [T + k for k in range(K) if k not in soil_columns(candidates)]
-        mine, states = np.array([*range(S), *others]), np.arange(S, T)
-        sigma = np.repeat([self.soil_sigma, self.effect_sigma], [S, len(others)])
-        H, gradient = np.diag(sigma**-2.0), np.zeros(len(mine))
-        for run, error in zip(self.runs, self.white_errors, strict=True):
-            G, gain = run.gram, run.rows[:, :-1].astype(float).T @ error
-            cross = G[np.ix_(states, mine)]
-            both = np.column_stack([cross, gain[states]])
-            own = np.linalg.solve(G[np.ix_(states, states)] + np.eye(T - S), both)
-            H += G[np.ix_(mine, mine)] - cross.T @ own[:, :-1]
-            gradient += gain[mine] - cross.T @ own[:, -1]
-        return np.asarray(self.share * np.linalg.solve(H, gradient)[:S])
+        mine = np.array([*range(T), *others])
+        sigma = np.repeat([SOIL_SIGMA, 1.0, EFFECT_SIGMA], [S, T - S, len(others)])
+        H = self.run.gram[np.ix_(mine, mine)] + np.diag(sigma**-2.0)
+        gain = self.run.rows[:, :-1].astype(float).T @ self.white_error
+        return np.asarray(self.share * np.linalg.solve(H, gain[mine])[:S])
 
     def accept_if_better(
-        self, soil: Array, predicted: Sequence[Sequence[Array] | None], noise: Mapping[str, ResidualNoise]
+        self, soil: Array, predicted: Sequence[Array] | None, noise: Mapping[str, ResidualNoise]
     ) -> None:
-        """Goes to a soil where its predictions are better, one array a channel of each run."""
-        known = [values for values in predicted if values is not None]
-        if len(known) == len(self.runs):
-            errors = [r.residuals.errors_of(values) for r, values in zip(self.runs, known, strict=True)]
-            white = [whitened_error(run, noise, e) for run, e in zip(self.runs, errors, strict=True)]
-            now, before = (sum(float(e @ e) for e in some) for some in (white, self.white_errors))
+        """Goes to a soil where its prediction is better, one array a channel."""
+        if predicted is not None:
+            error = self.run.residuals.errors_of(predicted)
+            white = whitened_error(self.run, noise, error)
+            now, before = float(white @ white), float(self.white_error @ self.white_error)
             if now < before:
-                self.soil, self.errors, self.white_errors = soil, errors, white
-                near = now > ENOUGH * before or now < GOOD * sum(map(len, white))
-                self.going = len(self.runs) > 1 or not near  # all others build on a soil that runs share
+                self.soil, self.error, self.white_error = soil, error, white
+                self.going = ENOUGH * before >= now >= GOOD * len(white)
                 return
         self.share *= SHORTER
         self.going = self.share >= LEAST_STEP
-
-
-def search_soil(
-    searches: Sequence[SoilSearch],
-    cache: LinearisationCache,
-    noise: Mapping[str, ResidualNoise],
-    limit: Array | float = MOST_SOIL,
-    jobs: int = 1,
-) -> None:
-    """Take the searches to their ends.
-
-    Args:
-        limit: of the soil (S,), in typical sizes from the model's.
-    """
-
-    def next_soil(search: SoilSearch) -> tuple[dict[str, float], Array]:
-        soil = search.soil + search.step(cache.candidates)
-        return with_run_soil(np.clip(soil, -limit, limit), cache, {})
-
-    for _ in range(STEPS):
-        going = [search for search in searches if search.going]
-        tried = in_threads(jobs, next_soil, going)
-        both = zip(going, tried, strict=True)
-        rollouts = [Rollout(run.log, effects) for search, (effects, _) in both for run in search.runs]
-        found = iter(aligned_predictions(rollouts, cache.model, cache.candidates, jobs))
-        predicted = [[next(found) for _ in search.runs] for search in going]
-        soils, same = [soil for _, soil in tried], [noise] * len(going)
-        in_threads(jobs, SoilSearch.accept_if_better, going, soils, predicted, same)
 
 
 def at_run_soil(
@@ -139,11 +98,26 @@ def at_run_soil(
     limit: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> list[RunResiduals]:
-    """Runs with errors linearised about their own soil; `limit` as for `search_soil`."""
-    searches = in_threads(jobs, lambda run: SoilSearch.of([run], noise, ALONE), runs)
-    search_soil(searches, cache, noise, limit, jobs)
+    """Runs with errors linearised about their own soil.
+
+    Args:
+        limit: of the soil (S,), in typical sizes from the model's.
+    """
+
+    def next_soil(search: SoilSearch) -> tuple[dict[str, float], Array]:
+        soil = search.soil + search.step(cache.candidates)
+        return with_run_soil(np.clip(soil, -limit, limit), cache, {})
+
+    searches = in_threads(jobs, lambda run: SoilSearch.of(run, noise), runs)
+    for _ in range(STEPS):
+        going = [search for search in searches if search.going]
+        tried = in_threads(jobs, next_soil, going)
+        rollouts = [Rollout(s.run.log, effects) for s, (effects, _) in zip(going, tried, strict=True)]
+        predicted = aligned_predictions(rollouts, cache.model, cache.candidates, jobs)
+        soils, same = [soil for _, soil in tried], [noise] * len(going)
+        in_threads(jobs, SoilSearch.accept_if_better, going, soils, predicted, same)
     return [
-        dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.errors[0]))
+        dataclasses.replace(run, soil=s.soil, error=referred_to_model(run, s.soil, s.error))
         for run, s in zip(runs, searches, strict=True)
     ]
 

@@ -75,12 +75,13 @@ class Sensitivity:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rollout:
-    """A prediction to make: a log, effects on top of the model's own, and poses (W, 3) at the windows' starts
-    (None: the log's own)."""
+    """A prediction to make: a log, effects on top of the model's own, poses (W, 3) at the windows' starts
+    (None: the log's own), and the model (None: that of all)."""
 
     log: PreparedLog
     effects: Mapping[str, float]
     start: Array | None = None
+    model: Model | None = None
 
     def poses(self) -> Array:
         return self.log.start if self.start is None else self.start
@@ -97,7 +98,8 @@ def aligned_predictions(
     done, out = list(rollouts), predictions(rollouts, model, candidates, jobs)
     again = list[int]()
     for i, (rollout, y) in enumerate(zip(rollouts, out, strict=True)):
-        if y is not None and candidates.any_world_fixed({**model.effects, **rollout.effects}):
+        own = (rollout.model or model).effects
+        if y is not None and candidates.any_world_fixed({**own, **rollout.effects}):
             done[i] = dataclasses.replace(rollout, start=aligned_start(rollout.log, y, rollout.poses()))
             again.append(i)
     for i, y in zip(again, predictions([done[i] for i in again], model, candidates, jobs), strict=True):
@@ -113,26 +115,31 @@ def predictions(
 ) -> list[list[Array] | None]:
     """Channels of each rollout; None in place of a run that diverged.
 
-    Rollouts that differ in the sensors alone, of the same log and array of poses, share a run. Each result is
-    the same as if computed alone.
+    Rollouts that differ in the sensors alone, of the same log, model and array of poses, share a run. Each
+    result is the same as if computed alone.
     """
-    effects = [{**model.effects, **r.effects} for r in rollouts]
-    starts = [r.poses() for r in rollouts]
-    shared: dict[tuple[int, MotionEffects, int], list[int]] = {}
-    for i, (r, some, start) in enumerate(zip(rollouts, effects, starts, strict=True)):
-        shared.setdefault((id(r.log), motion_effects(candidates, some), id(start)), []).append(i)
+    models = [r.model or model for r in rollouts]
+    effects = [{**m.effects, **r.effects} for m, r in zip(models, rollouts, strict=True)]
+    starts, shared = [r.poses() for r in rollouts], dict[tuple[int, MotionEffects, int, int], list[int]]()
+    for i, (r, some, start, m) in enumerate(zip(rollouts, effects, starts, models, strict=True)):
+        shared.setdefault((id(r.log), motion_effects(candidates, some), id(start), id(m)), []).append(i)
     runs, moved = list(shared.values()), [key[1] for key in shared]
-    sensors = {id(r.log): SampledSensors(r.log, model, candidates, r.log.samples()) for r in rollouts}
+    sensors = {
+        (id(r.log), id(m)): SampledSensors(r.log, m, candidates, r.log.samples())
+        for r, m in zip(rollouts, models, strict=True)
+    }
     out: list[list[Array] | None] = [None] * len(rollouts)
 
     def simulate(task: tuple[tuple[str, ...], list[int]]) -> None:
         group, some = task
         first = [runs[run][0] for run in some]
-        given = [(rollouts[i].log, dict(moved[run]), starts[i]) for i, run in zip(first, some, strict=True)]
-        lanes = make_lanes(given, model, candidates, group)
+        pairs = zip(first, some, strict=True)
+        given = [(rollouts[i].log, models[i], dict(moved[run]), starts[i]) for i, run in pairs]
+        lanes = make_lanes(given, candidates, group)
         for run, lane, x in zip(some, lanes, simulate_lanes(lanes), strict=True):
             for i in runs[run] if np.isfinite(x).all() else ():
-                y = sensors[id(lane.log)].read(x, lane.plant, lane.inputs, without_delays(effects[i]), group)
+                own = sensors[id(lane.log), id(models[i])]
+                y = own.read(x, lane.plant, lane.inputs, without_delays(effects[i]), group)
                 by_channel = zip(lane.log.observed, delayed_samples(lane.log, effects[i]), strict=True)
                 out[i] = [weighted_means(at, _channel(y, o.channel)) for o, at in by_channel]
 
@@ -171,7 +178,7 @@ def linearise(
         TerrafusionError: the run diverged.
     """
     sets = {NOMINAL: dict(model.effects)}
-    steps = {k: _step(candidates, i, model.effects.get(k, 0.0)) for i, k in enumerate(candidates.keys)}
+    steps = {k: _step(candidates, i, model.effects.get(k, 0.0), log) for i, k in enumerate(candidates.keys)}
     for k, step in steps.items():
         if only is None or k in only:
             sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
@@ -204,7 +211,7 @@ def _readings(
     for group in effect_groups(candidates):
         keys = [k for k in group if k in sets]
         nominal = NOMINAL in keys
-        lanes = make_lanes([(log, sets[k], start) for k in keys], model, candidates, group)
+        lanes = make_lanes([(log, model, sets[k], start) for k in keys], candidates, group)
         states = simulate_lanes(lanes, 1 if nominal else COARSE_STEP) if keys else []
         if nominal:
             if not np.isfinite(states[0]).all():
@@ -254,10 +261,16 @@ def _channel(outputs: Array, channel: str) -> Array:
     return outputs[:, columns[0]] if len(columns) == 1 else np.asarray(outputs[:, columns].mean(axis=1))
 
 
-def _step(candidates: Candidates, i: int, at: float) -> float:
-    """Step of one parameter, in its unit, towards the side where its range leaves room."""
-    step = STEP * float(candidates.scale[i])
-    return step if at + step <= candidates.high[i] else -step
+def _step(candidates: Candidates, i: int, at: float, log: PreparedLog) -> float:
+    """Step of one parameter, in its unit, towards the side where its range leaves room.
+
+    A delay on the way to the motors is at least the time between commands: samples that come in step with
+    them do not show a part of it.
+    """
+    step, low, high = STEP * float(candidates.scale[i]), float(candidates.low[i]), float(candidates.high[i])
+    if candidates.units[i] == "s" and candidates.keys[i] in candidates.moving:
+        step = min(max(step, log.input_step_s), 0.5 * (high - low))
+    return step if at + step <= high else -step
 
 
 def _by_pose(log: PreparedLog, states: Array, y: Array) -> Array:

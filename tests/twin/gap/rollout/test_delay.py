@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,12 @@ from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
 from terrafusion.twin.gap.rollout.delay import delayed_samples
-from terrafusion.twin.gap.rollout.sensitivities import Rollout, predictions
+from terrafusion.twin.gap.rollout.sensitivities import (
+    Rollout,
+    channel_sensitivities,
+    linearise,
+    predictions,
+)
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, IMU, without_delays
 from tests.twin.gap.runs import run
@@ -83,3 +90,32 @@ def test_an_offset_that_grows_is_that_of_its_row(log_and_model) -> None:
     assert time_of(grown, row) == pytest.approx(time_of(constant, row), abs=0.6)  # samples of 10 ms
     assert delayed_samples(log, {"gyro_bias/constant": 0.1}) == sample_map(log).fine
     assert without_delays({CLOCK_DRIFT: 0.6, "gyro_bias/constant": 0.1}) == {"gyro_bias/constant": 0.1}
+
+
+@pytest.mark.parametrize("key", ["dead_time/transport", "actuator_lag/command"])
+def test_the_derivative_by_a_delay_of_commands_is_seen_between_them(key: str) -> None:
+    """Commands came every 50 ms, and derivatives are kept as often: of 15 ms they showed a part."""
+    recording, candidates = run(1), Candidates.of(["dead_time", "actuator_lag"])
+    assert recording.command is not None
+    at = np.arange(recording.start_ns, recording.command.t_ns[-1], 50_000_000)
+    rows = np.searchsorted(recording.command.t_ns, at, side="right") - 1
+    seldom = dataclasses.replace(
+        recording.command, t_ns=at, v_mps=recording.command.v_mps[rows],
+        yaw_rate_radps=recording.command.yaw_rate_radps[rows],
+    )  # fmt: skip
+    known = load_vehicle("elevate")
+    stiff = dataclasses.replace(
+        known.drive, speed_loop_p_nms=10.0 * known.drive.speed_loop_p_nms,
+        max_accel_mps2=20.0, max_yaw_accel_radps2=40.0,
+    )  # fmt: skip
+    given = [dataclasses.replace(recording, command=seldom)], dataclasses.replace(known, drive=stiff)
+    (log,), model, _ = prepared(*given, None)
+    assert log.input_step_s == pytest.approx(0.05)
+    column = 3 + candidates.keys.index(key)
+    slope = channel_sensitivities(log, linearise(log, model, candidates, log.start, (key,)))[0].columns
+    plain, late = predictions([Rollout(log, {}), Rollout(log, {key: 0.1})], model, candidates)
+    assert plain is not None
+    assert late is not None
+    correlation = np.corrcoef(late[0] - plain[0], slope[:, column])[0, 1]
+    print(correlation)
+    assert correlation > 0.95

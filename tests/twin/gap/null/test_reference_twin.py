@@ -1,0 +1,66 @@
+"""The twin drives as the references do before anything is a change of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.logs import prepared
+from terrafusion.twin.gap.null.reference_twin import RUNS, set_to_references
+from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
+from tests.twin.gap.runs import DRIVE
+
+CANDIDATES = Candidates.of(["soil_strength", "wheel_radius"])
+STIFFER, STRONGER = 3.0, {"soil_strength/shear": 0.4, "soil_strength/bearing": 0.8}
+
+
+def references() -> list[Recording]:
+    """Of a robot whose motors follow more stiffly than its file says, on ground that is stronger."""
+    known = load_vehicle("elevate")
+    drive = dataclasses.replace(known.drive, speed_loop_p_nms=STIFFER * known.drive.speed_loop_p_nms)
+    robot = dataclasses.replace(known, drive=drive)
+    return [
+        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k, effects=STRONGER), name=f"reference {k}")
+        for k in range(RUNS)
+    ]
+
+
+def wheel_error(log, model: Model) -> float:
+    """Root mean square, rad/s."""
+    channels = tuple(o.channel for o in log.observed)
+    found = run_residuals(log, LinearisationCache(model, CANDIDATES), channels)
+    return float(np.sqrt(np.mean(found.error[channels.index("wheel_left_radps")] ** 2)))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple:
+    logs, model, _ = prepared(references(), load_vehicle("elevate"), "loose_sand")
+    channels = tuple(o.channel for o in logs[0].observed)
+    return logs, model, set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+
+
+def test_the_speed_loop_and_the_ground_are_those_of_the_references(fitted) -> None:
+    _, model, found = fitted
+    stiffer = found.vehicle.drive.speed_loop_p_nms / model.vehicle.drive.speed_loop_p_nms
+    print(stiffer, found.effects, [wheel_error(log, m) for log in fitted[0] for m in (model, found)])
+    assert stiffer == pytest.approx(STIFFER, rel=0.25)
+    assert found.effects["soil_strength/shear"] == pytest.approx(0.4, abs=0.15)
+
+
+def test_the_twin_then_errs_less(fitted) -> None:
+    logs, model, found = fitted
+    assert wheel_error(logs[0], found) < 0.5 * wheel_error(logs[0], model)
+
+
+def test_drives_of_another_twin_are_linearised_anew(fitted) -> None:
+    logs, model, found = fitted
+    plain = dataclasses.replace(found, effects=model.effects)
+    keys = {LinearisationCache(m, CANDIDATES).key(logs[0]) for m in (model, plain, found)}
+    assert len(keys) == 3
