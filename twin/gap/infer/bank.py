@@ -30,6 +30,9 @@ APART = 0.15
 soils; the end of a law's range is then simulated there as well."""
 THRESHOLDS = (0.4, 0.7, 1.0)
 """Sizes of an insensitive law, in that of its range: it acts beyond a threshold, if at all."""
+DELAYED = (1.0, 3.0, 8.0)
+"""Typical sizes at which a delay on the way to the motors is simulated at once: its sensitivity may be of the
+other sign than what a whole delay does."""
 
 
 Ladder = tuple[Array, tuple[int, ...]]
@@ -65,10 +68,11 @@ class SignatureBank:
 
     @classmethod
     def of(cls, evidence: GapEvidence, simulate: bool = True) -> SignatureBank:
-        """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones by
-        rollout, unless `simulate` is false."""
+        """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones and
+        delays by rollout, too, unless `simulate` is false."""
         signatures: dict[Hypothesis, dict[float, list[Array]]] = {}
-        candidates, insensitive = evidence.candidates, list[SimulatedSize]()
+        candidates, simulated = evidence.candidates, list[SimulatedSize]()
+        soils = model_soil(evidence)
         columns = [run.by_parameter for run in evidence.runs]
         for law in candidates.hypotheses:
             if not is_simulated(law, candidates):
@@ -80,12 +84,12 @@ class SignatureBank:
             for end in {float(low.max()), float(high.min())} - {0.0}:
                 if square * end**2 >= INSENSITIVE:
                     signatures[law][end] = [end * s for s in slope]
-                elif simulate:
-                    sizes, soils = [share * end for share in THRESHOLDS], model_soil(evidence)
-                    insensitive += [SimulatedSize(law, size, soils) for size in sizes]
-        return dataclasses.replace(cls.empty(evidence), signatures=signatures).with_sizes(
-            evidence, insensitive
-        )
+                else:
+                    simulated += [SimulatedSize(law, share * end, soils) for share in THRESHOLDS]
+            if candidates.units[law.columns[0]] == "s" and candidates.keys[law.columns[0]] not in DELAYS:
+                simulated += [SimulatedSize(law, x, soils) for x in DELAYED if x < float(high.max())]
+        bank = dataclasses.replace(cls.empty(evidence), signatures=signatures)
+        return bank.with_sizes(evidence, simulated) if simulate else bank
 
     def only(self, laws: Iterable[Hypothesis]) -> SignatureBank:
         """With some laws alone."""

@@ -2,7 +2,8 @@
 
 References teach errors of the twin, scatter of the ground and noise for the drives that they made. The time
 of the judged runs is counted by cell of commanded speed, turn rate and acceleration; a cell is covered where
-the references spent at least a second in it, or as long as the judged runs.
+the references spent at least a second in it, or as long as the judged runs. Cells are shares of the speed and
+turn rate that the references reach: half the speed is another drive for a slow robot, too.
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.rollout.nuisance import commanded_acceleration, commanded_twist
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
-SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2 = 0.3, 0.3, 0.6
-"""Width of a cell; the middle one is centred on zero."""
+CELL_SHARE, REACHED = 0.2, 0.95
+"""Width of a cell, as a share of this quantile of the references' speeds or turn rates; the middle one is
+centred on zero."""
+NARROWEST, WIDEST = 0.05, 0.3  # limits of that width, m/s and rad/s (assumed)
+ACCELERATION_MPS2 = 0.6  # width of a cell
 LEAST_S = 1.0  # time of all references in a cell from which it counts as covered (assumed)
 MOST_LISTED = 4
 LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
@@ -47,10 +51,16 @@ class DriveCoverage:
         return self.covered < MOSTLY_COVERED
 
 
-def by_cell(twist: Array) -> Samples:
-    """Samples of a commanded twist (N, 2), m/s and rad/s."""
+def cell_widths(references: Sequence[Array]) -> Array:
+    """Widths (3,) of the cells by the references' commanded twists (N, 2) each."""
+    reached = np.quantile(np.abs(np.concatenate(references)), REACHED, axis=0)
+    return np.append(np.clip(CELL_SHARE * reached, NARROWEST, WIDEST), ACCELERATION_MPS2)
+
+
+def by_cell(twist: Array, widths: Array) -> Samples:
+    """Samples of a commanded twist (N, 2), m/s and rad/s, in cells of widths (3,)."""
     columns = np.column_stack([twist, commanded_acceleration(twist[:, 0])])
-    index = np.round(columns / [SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2]).astype(np.int64)
+    index = np.round(columns / widths).astype(np.int64)
     low, sides = index.min(axis=0), tuple((np.ptp(index, axis=0) + 1).tolist())
     number, count = np.unique(np.ravel_multi_index(tuple((index - low).T), sides), return_counts=True)
     cells = (np.stack(np.unravel_index(number, sides), axis=1) + low).tolist()
@@ -71,11 +81,14 @@ def drive_coverage(
 
 def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverage:
     """Coverage of commanded twists (N, 2) each, by those of references."""
-    known, judged = (sum(map(by_cell, some), Samples()) for some in (references, runs))
+    widths = cell_widths(references)
+    known, judged = (
+        sum((by_cell(twist, widths) for twist in some), Samples()) for some in (references, runs)
+    )
     lacking = {cell: n for cell, n in judged.items() if known[cell] < min(LEAST_S / DT_S, n)}
     words = Counter[str]()
     for cell, n in lacking.items():
-        words[_words(cell)] += n
+        words[_words(cell, widths)] += n
     long = [name for name in words if words[name] >= LEAST_MISSING * judged.total()]
     order = sorted(long, key=lambda name: (-words[name], name))[:MOST_LISTED]
     listed = tuple(f"{name} ({DT_S * words[name]:.0f} s)" for name in order)
@@ -85,9 +98,11 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     """Share of the commands, by time, that runs and references have in common, over that of as many of the
     references with the rest, less `SPREAD_SIGMAS` of one of these; at most one. Twists as for `coverage`."""
-    size, known = min(len(runs), len(references) // 2), [by_cell(twist) for twist in references]
+    size = min(len(runs), len(references) // 2)
     if not size:
         return 1.0
+    widths = cell_widths(references)
+    known = [by_cell(twist, widths) for twist in references]
     own = [
         _in_common(known[i : i + size], [*known[:i], *known[i + size :]])
         for i in range(0, len(known) - size + 1, size)
@@ -95,7 +110,7 @@ def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:
     alone = [_in_common([one], [*known[:i], *known[i + 1 :]]) for i, one in enumerate(known)]
     spread = float(np.std(alone)) / max(float(np.mean(alone)), 1e-9)
     usual = float(np.mean(own)) * (1.0 - SPREAD_SIGMAS * spread)
-    return min(_in_common([by_cell(twist) for twist in runs], known) / max(usual, 1e-9), 1.0)
+    return min(_in_common([by_cell(twist, widths) for twist in runs], known) / max(usual, 1e-9), 1.0)
 
 
 def _in_common(runs: Sequence[Samples], others: Sequence[Samples]) -> float:
@@ -103,8 +118,8 @@ def _in_common(runs: Sequence[Samples], others: Sequence[Samples]) -> float:
     return sum(min(n / a.total(), b[cell] / b.total()) for cell, n in a.items())
 
 
-def _words(cell: Cell) -> str:
-    speed, turn, acceleration = cell[0] * SPEED_MPS, cell[1] * TURN_RADPS, cell[2]
+def _words(cell: Cell, widths: Array) -> str:
+    speed, turn, acceleration = float(cell[0] * widths[0]), float(cell[1] * widths[1]), cell[2]
     how = "steady" if acceleration == 0 else "speeding up" if acceleration * (cell[0] or 1) > 0 else "braking"
     where = "straight" if cell[1] == 0 else f"turning {turn:+.1f} rad/s"
     return f"{speed:.1f} m/s, {where}, {how}"

@@ -2,11 +2,12 @@
 
 How all laws act depends on the ground and on how stiffly the motors follow, which owners hardly know. Effects
 are changes of a twin that drives as the references do: such numbers are fitted to them by damped Gauss-Newton
-steps (Marquardt 1963).
+steps (Marquardt 1963), from the best of a few starts.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,9 @@ NUMBERS = (
     "soil.resistance.rolling", "vehicle.drive.speed_loop_p_nms", "vehicle.drive.speed_loop_i_nm",
 )  # fmt: skip
 """What is fitted: strength of the ground, and how soft and how sticky it is; gains of the speed loop."""
+STARTS = {"shear_modulus_m": -3.0, "speed_loop_p_nms": 2.7, "speed_loop_i_nm": -6.0}
+"""Where the search may begin instead, in scales: ground without give, motors that follow stiffly, and ones
+without an integral. From too soft a loop it would end in a minimum with too large an integral."""
 SIGMA = 2.0  # 1 sigma of a number, in scales of `Coordinate` (assumed)
 EFFECT_SIGMA = 0.1
 """1 sigma of effects beside, in typical sizes (assumed): the numbers explain what they can."""
@@ -113,9 +117,8 @@ class _Fit:
 
     def solve(self) -> Array:
         """The numbers that fit best."""
-        w, damping = np.zeros(len(self.numbers)), DAMPING
-        (errors,) = self.errors([w])
-        cost = self.cost(w, errors)
+        w, errors, cost = self._start()
+        damping = DAMPING
         for _ in range(STEPS):
             if errors is None:
                 break
@@ -135,6 +138,15 @@ class _Fit:
             if gain < ENOUGH:
                 break
         return w
+
+    def _start(self) -> tuple[Array, list[Array] | None, float]:
+        """The best of the starts, with its errors and cost."""
+        others = [STARTS.get(c.name.rpartition(".")[2]) for c in self.numbers]
+        points = [np.array(p) for p in itertools.product(*((0.0, x) if x else (0.0,) for x in others))]
+        errors = self.errors(points)
+        costs = [self.cost(w, e) for w, e in zip(points, errors, strict=True)]
+        best = int(np.argmin(costs))
+        return points[best], errors[best], costs[best]
 
     def _normal(self, w: Array, errors: Sequence[Array]) -> tuple[Array, Array]:
         """Information (K, K) on the numbers and gradient (K,) of the fit; none where the twin diverges."""

@@ -27,6 +27,13 @@ def test_what_references_never_drove_is_named_with_its_time() -> None:
     assert found.missing[0].startswith("1.2 m/s, turning -0.6 rad/s, steady (10 s")
 
 
+def test_half_the_speed_is_another_drive_for_a_slow_robot_too() -> None:
+    """In cells as wide as for a fast one all its drives were alike, and limited no answer."""
+    found = coverage([steady(0.2, 0.25, 20.0)], [steady(0.4, 0.4, 60.0)])
+    assert found.covered == pytest.approx(0.0)
+    assert found.limits()
+
+
 def test_a_moment_does_not_cover() -> None:
     found = coverage([steady(0.9, 0.0, 10.0)], [steady(0.9, 0.0, 0.5)])
     assert found.covered == pytest.approx(0.0)
