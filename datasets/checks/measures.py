@@ -21,6 +21,7 @@ from terrafusion.datasets.checks.path import (
     PathFits,
     dead_reckoned,
     fit_windows,
+    is_straight,
     path_by,
     scale_of,
 )
@@ -219,7 +220,8 @@ def _whole(context: CheckContext, measured: MeasuredPath) -> PathFits | None:
     pp, gg, pg = np.vdot(p, p).real, np.vdot(g, g).real, abs(np.vdot(p, g))
     if min(pp, gg) <= n * max(LEAST_SPREAD_M, 3.0 * measured.sigma_m) ** 2:
         return None
-    fit = (pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), np.nan)  # too few for a scatter
+    straight = is_straight(context, p, g)
+    fit = (pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), np.nan, straight)  # too few for a scatter
     return PathFits(*(np.array([value]) for value in fit))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.finding import CheckContext, once
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
@@ -22,6 +22,9 @@ this time, since the gyro drifts."""
 LEAST_FIXES, LEAST_WINDOWS = 5, 5
 LEAST_COHERENCE = 0.9
 """Correlation of the two paths in a window below which its scale is not used."""
+MOST_BEND_RAD = 0.3
+"""Without a gyro the dead-reckoned path is straight: a stretch that bends by so much is 0.4 % longer than its
+chord."""
 WHEEL_UNITS = (5e-4, 50.0)
 """From speeds in mm/s to speeds mistaken for rates; beyond these the positions have another unit."""
 BENDS = 6.0
@@ -49,6 +52,7 @@ class PathFits:
         span_ratio: spread of the measured path over that of the dead-reckoned one, whatever their shapes.
         scatter_m: 1 sigma of a position along one axis, from second differences of the residuals:
             slow errors do not count.
+        straight: whether the dead-reckoned path has the bends of the measured one.
     """
 
     scale: Array
@@ -56,6 +60,7 @@ class PathFits:
     weight: Array
     span_ratio: Array
     scatter_m: Array
+    straight: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -144,7 +149,7 @@ def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFit
     length_m = float(np.clip(SIGMAS * measured.sigma_m, SHORTEST_M, longest_m))
     passed = np.maximum(np.diff(distance) / length_m, np.diff(t) / LONGEST_S)
     window = np.interp(t_fix, t, np.concatenate([[0.0], np.cumsum(passed)])).astype(int)
-    return _fit(window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * measured.sigma_m))
+    return _fit(context, window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * measured.sigma_m))
 
 
 def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
@@ -164,7 +169,9 @@ def antenna(context: CheckContext) -> complex:
     return complex(arm[0], arm[1]) if arm is not None else 0j
 
 
-def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: float) -> PathFits | None:
+def _fit(
+    context: CheckContext, window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: float
+) -> PathFits | None:
     """The fits in the windows in which the robot moves enough; `window` (N,) rises."""
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     n = np.diff(np.append(starts, len(window)))
@@ -181,17 +188,38 @@ def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: floa
     bend[1:-1] = np.abs(residual[2:] - 2.0 * residual[1:-1] + residual[:-2]) ** 2
     bend[starts] = bend[starts + n - 1] = 0.0  # these reach into the neighbouring windows
     scatter = np.sqrt(np.add.reduceat(bend, starts) / (2 * BENDS) / np.maximum(n - 2, 1))
+    rows = [slice(start, start + count) for start, count in zip(starts[use], n[use], strict=True)]
+    straight = np.array([is_straight(context, p[row], g[row]) for row in rows])
     pp, gg, pg = pp[use], gg[use], np.abs(pg[use])
-    return PathFits(pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), scatter[use])
+    return PathFits(pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), scatter[use], straight)
+
+
+@once
+def _has_gyro(context: CheckContext) -> bool:
+    return motion.gyro_angle(context.recording) is not None
+
+
+def is_straight(context: CheckContext, p: Complex, g: Complex) -> bool:
+    """Whether dead-reckoned positions (n,) know the bends of the measured ones: by a gyro, or as none.
+
+    The bend is that of a parabola along the distance rolled.
+    """
+    if _has_gyro(context):
+        return True
+    along = p.real - p.real.mean()
+    half = max(0.5 * float(np.ptp(along)), 1e-9)
+    square, slope, _ = np.polyfit(along / half, g, 2)
+    return bool(4.0 * abs(square) < MOST_BEND_RAD * abs(slope))
 
 
 def scale_of(fits: PathFits, source: str) -> PathScale | None:
     """The scale over all coherent windows, with its interval by bootstrap over windows.
 
-    None where most windows are not coherent: then slip, jumps or a wrong gyro bend one of the paths.
+    None where most windows are not coherent: then slip, jumps or a wrong gyro bend one of the paths; and
+    where few are straight, without a gyro.
     """
-    use = fits.coherence > LEAST_COHERENCE
-    if use.sum() < max(LEAST_WINDOWS, 0.5 * len(use)):
+    use = (fits.coherence > LEAST_COHERENCE) & fits.straight
+    if use.sum() < max(LEAST_WINDOWS, 0.5 * fits.straight.sum()):
         return None
     weight, scale = fits.weight[use], fits.scale[use]
     draws = resampled_rows(len(scale))

@@ -10,9 +10,11 @@ import pytest
 
 from terrafusion.datasets.checks import scale
 from terrafusion.datasets.checks.finding import CheckContext, Finding
-from terrafusion.datasets.checks.path import PathScale
+from terrafusion.datasets.checks.path import PathScale, scales
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from tests.datasets.conftest import RADIUS_M, make_drive
 
 
@@ -40,6 +42,20 @@ def judged(
     monkeypatch.setattr(scale, "scales", lambda _: [wide, found])
     monkeypatch.setattr(CheckContext, "known", lambda self, name: wheel_scale)
     return list(scale.check_speed_scale(CheckContext(recording, None)))
+
+
+def test_without_a_gyro_the_scale_is_that_of_straight_stretches() -> None:
+    """A chord is shorter than the path of a bend: the wheels seemed to read 4 % too much."""
+    t_s = np.arange(0.0, 240.0, 0.1)
+    rate = np.where(t_s % 60.0 < 30.0, 0.0, 0.3 * np.sin(2.0 * np.pi * t_s / 15.0))
+    place = np.cumsum(np.exp(1j * np.cumsum(rate) * 0.1)) * 0.1
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    zero = np.zeros(len(t_s))
+    truth = Trajectory(t_ns, np.column_stack([place.real, place.imag, zero]))
+    wheels = Wheels(t_ns, np.full((len(t_s), 2), 1.02), ("left", "right"), unit="mps")
+    log = Recording(name="bends", start_ns=0, wheels=wheels, truth=truth)
+    ((found, _),) = scales(CheckContext(log, None))
+    assert found.ratio == pytest.approx(1.0 / 1.02, rel=2e-3)
 
 
 def codes(findings: list[Finding]) -> list[str]:
