@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
+from terrafusion.twin.gap.infer.bank import DELAYED, SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.explain import _Explainer
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
@@ -50,3 +50,13 @@ def test_a_larger_size_to_try_does_not_displace_the_best_one(evidence: GapEviden
     own = _Explainer(evidence, sigma, robot, ())
     bank = own.with_first_sizes(own.look(SignatureBank.of(evidence)), {0: [0.9 * TOP]})
     np.testing.assert_allclose(bank.sizes(LAW), [-TOP, 0.0, 0.9 * TOP, TOP])
+
+
+def test_a_delay_of_commands_is_simulated_at_whole_sizes_from_the_start() -> None:
+    """On a robot whose sensitivity had the other sign a dead time of .15 s was found by no later look."""
+    candidates = Candidates.of(["dead_time"])
+    evidence = gather_evidence(runs(980, 1), runs(985, 3), load_vehicle("elevate"), None, candidates)
+    bank = SignatureBank.of(evidence)
+    assert all({*DELAYED} < {*bank.sizes(law).tolist()} for law in candidates.hypotheses)
+    by_sensitivity = SignatureBank.of(evidence, simulate=False)
+    assert not any({*DELAYED} & {*by_sensitivity.sizes(law).tolist()} for law in candidates.hypotheses)
