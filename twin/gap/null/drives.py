@@ -21,8 +21,8 @@ from terrafusion.twin.gap.rollout.nuisance import commanded_acceleration, comman
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 CELL_SHARE, REACHED = 0.2, 0.95
-"""Width of a cell, as a share of this quantile of the references' speeds or turn rates; the middle one is
-centred on zero."""
+"""Greatest width of a cell, as a share of this quantile of the references' speeds or turn rates; the middle
+one is centred on zero."""
 NARROWEST, WIDEST = 0.05, 0.3  # limits of that width, m/s and rad/s (assumed)
 ACCELERATION_MPS2 = 0.6  # width of a cell
 LEAST_S = 1.0  # time of all references in a cell from which it counts as covered (assumed)
@@ -54,7 +54,8 @@ class DriveCoverage:
 def cell_widths(references: Sequence[Array]) -> Array:
     """Widths (3,) of the cells by the references' commanded twists (N, 2) each."""
     reached = np.quantile(np.abs(np.concatenate(references)), REACHED, axis=0)
-    return np.append(np.clip(CELL_SHARE * reached, NARROWEST, WIDEST), ACCELERATION_MPS2)
+    parts = np.ceil(WIDEST / np.clip(CELL_SHARE * reached, NARROWEST, WIDEST))  # middles are round numbers
+    return np.append(WIDEST / parts, ACCELERATION_MPS2)
 
 
 def by_cell(twist: Array, widths: Array) -> Samples:
