@@ -108,7 +108,7 @@ def diagnose_evidence(
         notes.append(TOO_FEW.format(len(normal), FEWEST))
         in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
-    scales = (1.0,) if uncalibrated else SCATTER_SCALES
+    scales = SCATTER_SCALES[-1:] if uncalibrated else SCATTER_SCALES
     offsets = learn_offsets(normal, len(candidates.keys), scales)
     planner = Planner.of(evidence, sigma, offsets, scores)
     judged, robot = evidence, offsets

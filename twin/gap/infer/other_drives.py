@@ -21,9 +21,8 @@ from terrafusion.twin.gap.rollout.nuisance import BASIS
 CANDIDATE_SCATTER, NUISANCE_SCATTER, PRIOR_RUNS = 0.15, 0.05, 4.0
 """Prior 1 sigma from run to run of an effect and of a column of the nuisance basis, in their units, and its
 weight in runs (set on the twin's own runs on other drives than the study's)."""
-SCATTER_SCALES = (0.3, 1.0, 3.0)
-"""Factors of that sigma, of which the references choose the likeliest: runs of one robot may be alike, or the
-loads of its wheels differ much on uneven ground."""
+SCATTER_SCALES = (0.3, 1.0)
+"""Factors of that sigma, of which the references choose the likelier: runs of one robot may be alike."""
 PRIOR_COLUMNS = 8.0
 """Weight, in columns, of an offset's prior variance of one, the least. A larger one is learned, for the
 effects together and for the columns of each channel: where the twin is wrong on the references' drives, it
