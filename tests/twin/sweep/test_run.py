@@ -116,7 +116,10 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
         _wait_for_parts(tmp_path / "out", 2, child)
         child.send_signal(signal.SIGINT)
         begun = time.monotonic()
-        _, said = child.communicate(timeout=60.0)
+        try:
+            _, said = child.communicate(timeout=60.0)
+        finally:
+            child.kill()  # one that does not end would be waited for without end
     assert time.monotonic() - begun < 10.0
     assert said == "stopped\n"
 
