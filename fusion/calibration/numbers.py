@@ -62,7 +62,7 @@ IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
 COMMON_DELAY_S, TURN_SLIP_M = 0.1, 0.25
 """1 sigma of the two changes of `feigned_by_slip`: clean drives of the twin below seed 50 showed 0.1 to
-0.5 s, and 0.03 to 0.2 m, more on mud. With more than 0.1 s an antenna 0.6 m off is not seen on firm ground."""
+0.5 s, and 0.03 to 0.2 m, more on mud. With more than 0.1 s an antenna 0.6 m off on asphalt is not seen."""
 CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01, 0.05]), 0.05
 """Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
 the turn scale where there is no gyro."""
