@@ -32,7 +32,7 @@ class TerrainDetector:
         credit: of an external source.
 
     Raises:
-        ConfigError: `classes` has no `unknown`, or a name twice.
+        ConfigError: `classes` has no `unknown`, a name twice, or lacks a ground of the model's spectrum.
     """
 
     def __init__(self, model: TerrainModel, classes: tuple[str, ...]) -> None:
@@ -40,6 +40,12 @@ class TerrainDetector:
             raise ConfigError(
                 f"terrain classes {', '.join(classes)} must differ and hold '{UNKNOWN}'",
                 remedy="mend the policy",
+            )
+        lacking = () if model.spectrum is None else sorted(set(model.spectrum.grounds) - set(classes))
+        if lacking:
+            raise ConfigError(
+                f"terrain classes {', '.join(classes)} lack {', '.join(lacking)} of the terrain model",
+                remedy="add the grounds of the model",
             )
         self.classes = classes
         self._table, self._spectrum = LikelihoodTable(model, classes), model.spectrum

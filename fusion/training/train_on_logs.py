@@ -23,6 +23,7 @@ from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft
 
 FOLDS = 5
 DOUBTS = (0.0, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.17, 0.25, 0.35)
+"""Values of `TerrainModel.doubt` that are tried."""
 MIN_RUNS = 2
 """Of a ground: one to fit to, one to calibrate or to test on."""
 

@@ -183,3 +183,8 @@ def test_a_model_file_with_a_broken_classifier_is_refused(model: TerrainModel, t
         path.write_text(text.replace(old, new))
         with pytest.raises(ConfigError, match=what):
             load_terrain_model(path)
+
+
+def test_classes_that_lack_a_ground_of_the_model_are_refused(model: TerrainModel) -> None:
+    with pytest.raises(ConfigError, match="lack cobbles of the terrain model"):
+        TerrainDetector(model, ("track", "unknown"))
