@@ -40,10 +40,6 @@ class RejectedError(ValueError):
         super().__init__(what)
         self.what, self.remedy = what, remedy
 
-    def inside(self, suffix: str) -> "RejectedError":
-        """The same about a part of the value, `{key}` and `suffix`."""
-        return RejectedError(self.what.replace("{key}", f"{{key}}{suffix}"), self.remedy)
-
     def at(self, key: str, file: Path | str) -> ConfigError:
         """The error as a user sees it."""
         return ConfigError(self.what.replace("{key}", key), file=file, remedy=self.remedy)
@@ -59,6 +55,13 @@ class Parsed(ABC):
         Raises:
             RejectedError: it is not allowed.
         """
+
+    def parse_part(self, raw: Any, suffix: str) -> Any:
+        """`parse` for a part of a value, whose errors add `suffix` to the key."""
+        try:
+            return self.parse(raw)
+        except RejectedError as error:
+            raise RejectedError(error.what.replace("{key}", f"{{key}}{suffix}"), error.remedy) from None
 
     @abstractmethod
     def schema(self) -> dict[str, Any]:
@@ -163,10 +166,7 @@ class Sourced(Quantity):
         return value
 
     def _check_valid(self, value: float | tuple[float, ...], valid: Any) -> None:
-        try:
-            low, high = Quantity(self.unit, self.low, self.high, size=2).parse(valid)  # type: ignore[misc]
-        except RejectedError as error:
-            raise error.inside(".valid") from None
+        low, high = Quantity(self.unit, self.low, self.high, size=2).parse_part(valid, ".valid")
         if not all(low <= x <= high for x in (value if isinstance(value, tuple) else (value,))):
             what = f"'{{key}}' is {shown(value)}, outside its validity range"
             raise RejectedError(what, f"its source covers [{low:g}, {high:g}] {self.unit}".rstrip())

@@ -81,26 +81,22 @@ class Known(Parsed):
             if name not in KnownNumber.__dataclass_fields__:
                 what = f"'{{key}}' has the unknown entry '{shown(name)}'"
                 raise RejectedError(what, f"known here: {', '.join(KnownNumber.__dataclass_fields__)}")
-        value = self._part(self.quantity, raw, "value")
-        known = self._part(Word(KNOWN), raw, "known")
+        value = self.quantity.parse_part(raw.get("value"), ".value")
+        known = Word(KNOWN).parse_part(raw.get("known"), ".known")
         sigma = None
         if "sigma" in raw:
             pair = isinstance(raw["sigma"], (list, tuple)) and self.quantity.size
-            sigma = self._part(Quantity(self.unit, 1e-9, 1e3, size=2 if pair else 0), raw, "sigma")
+            positive = Quantity(self.unit, 1e-9, 1e3, size=2 if pair else 0)
+            sigma = positive.parse_part(raw["sigma"], ".sigma")
         elif known == "calibrated" or (known in LENGTH_SIGMA_M and self.unit != "m"):
             raise RejectedError("'{key}' has no sigma", f"give 1 sigma of what is {known}")
         logs = raw.get("logs", [])
         if not isinstance(logs, list) or not all(isinstance(log, str) for log in logs):
             raise RejectedError(f"'{{key}}.logs' is '{shown(logs)}'", "give a list of names")
-        gained = self._part(Quantity("nats"), raw, "gained_nats") if "gained_nats" in raw else None
+        gained = None
+        if "gained_nats" in raw:
+            gained = Quantity("nats").parse_part(raw["gained_nats"], ".gained_nats")
         return KnownNumber(value, known, sigma, tuple(logs), gained)
-
-    @staticmethod
-    def _part(kind: Quantity | Word, raw: Mapping[str, Any], name: str) -> Any:
-        try:
-            return kind.parse(raw.get(name))
-        except RejectedError as error:
-            raise error.inside(f".{name}") from None
 
     def schema(self) -> dict[str, Any]:
         value = self.quantity.schema()

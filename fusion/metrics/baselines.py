@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks.motion import cumulative
 from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
-from terrafusion.datasets.core.channels import Fix, Gnss, Wheels
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
@@ -133,12 +134,12 @@ def dead_reckoning(recording: Recording, wheel_radius_m: float, track_m: float) 
         rest = at < begin_s
         if rest.any() and begin_s - at[0] >= REST_S:
             rate = rate - rate[rest].mean()
-        yaw = np.interp(t, at, _cumulative(at, rate))
-    elif isinstance(wheels, Wheels) and wheels.has_sides():
-        yaw = _cumulative(t, (sides[:, 1] - sides[:, 0]) / track_m)
+        yaw = np.interp(t, at, cumulative(at, rate))
+    elif wheels.has_sides():
+        yaw = cumulative(t, (sides[:, 1] - sides[:, 0]) / track_m)
     else:
         return None
-    rolled = np.diff(_cumulative(t, speed))
+    rolled = np.diff(cumulative(t, speed))
     steps = rolled * np.exp(0.5j * (yaw[1:] + yaw[:-1]))
     return ReckonedPath(t_ns, np.concatenate([[0j], np.cumsum(steps)]), yaw)
 
@@ -205,10 +206,6 @@ def _valid(gnss: Gnss | None) -> Gnss | None:
         return None
     fixes = gnss.select(np.isfinite(gnss.enu_m[:, :2]).all(axis=1) & (gnss.fix != Fix.NONE))
     return fixes if len(fixes) > 1 else None
-
-
-def _cumulative(t: Array, rate: Array) -> Array:
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
 
 
 def rms(values: Array | None) -> float | None:

@@ -4,13 +4,13 @@ Tests of what the run itself shows, most of them chi-square tests of its errors 
 own covariance. The limits are constants below; docs/reference/verdict.md lists the rules.
 """
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrafusion.datasets.checks import CheckContext
+from terrafusion.datasets.checks.motion import runs
 from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import SMALL, is_firm
 from terrafusion.datasets.core.channels import Gnss
@@ -278,9 +278,10 @@ def _rejections(run: Run) -> Iterator[Reason]:
     against = [
         not i.accepted or (k > 0 and rejected[k - 1] and i.nis > GATE_NIS) for k, i in enumerate(fixes)
     ]
-    longest = _longest(against)
-    if longest is not None and longest[1] - longest[0] >= IN_A_ROW:
-        first, end = longest
+    begins, ends = runs(np.array(against))
+    spans = zip(begins.tolist(), ends.tolist(), strict=True)
+    first, end = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
+    if end - first >= IN_A_ROW:
         size = float(np.median([np.hypot(*i.value[:2]) for i in fixes[first:end]]))
         at = since_s(run, fixes[first].t_ns)
         yield (
@@ -378,17 +379,6 @@ def _fix_sigma_m(used: Gnss | None) -> float:
     sigma = np.zeros(0) if used is None else used.sigma_enu_m[:, :2].max(axis=1)
     sigma = sigma[np.isfinite(sigma)]
     return float(np.median(sigma)) if len(sigma) else 0.0
-
-
-def _longest(flags: Sequence[bool]) -> tuple[int, int] | None:
-    """First index of the longest run of True, and the one after its last."""
-    best, at = None, 0
-    for flag, group in itertools.groupby(flags):
-        end = at + len(list(group))
-        if flag and (best is None or end - at > best[1] - best[0]):
-            best = at, end
-        at = end
-    return best
 
 
 def _sentence(text: str) -> str:

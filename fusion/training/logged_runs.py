@@ -61,14 +61,7 @@ def run_of(recording: Recording, vehicle: str | None = None) -> LoggedRun:
     Raises:
         DataError: the recording has no true label, or cannot be replayed.
     """
-    grounds = true_grounds(recording)
-    if not grounds:
-        raise DataError(
-            f"{recording.name}: no ground label",
-            channel="terrain",
-            remedy="name it in meta.yaml ('terrain'), or add terrain.csv",
-        )
-    labels = GroundLabels(*zip(*grounds, strict=True))
+    labels = GroundLabels(*zip(*labelled_grounds(recording), strict=True))
     windows: list[Window] = []
     names: list[str] = []
 
@@ -83,3 +76,15 @@ def run_of(recording: Recording, vehicle: str | None = None) -> LoggedRun:
 
     used = replay(recording, vehicle=vehicle, mode="fixed", findings=(), watch=watch).vehicle
     return LoggedRun(recording.name, used.name, changes_in(windows, np.array(names)))
+
+
+def labelled_grounds(recording: Recording) -> list[tuple[int, str]]:
+    """Start (ns) and name of each ground of a labelled run; "" is no label.
+
+    Raises:
+        DataError: the recording has no annotated or simulated ground.
+    """
+    if grounds := true_grounds(recording):
+        return grounds
+    remedy = "name it in meta.yaml ('terrain'), or add terrain.csv"
+    raise DataError(f"{recording.name}: no ground label", channel="terrain", remedy=remedy)

@@ -22,7 +22,6 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.terrain.classifier import UNKNOWN
-from terrafusion.fusion.terrain.external import true_grounds
 from terrafusion.fusion.training.ground_samples import (
     SLIP_S,
     GroundSamples,
@@ -30,6 +29,7 @@ from terrafusion.fusion.training.ground_samples import (
     slips_of,
     yaw_scales_of,
 )
+from terrafusion.fusion.training.logged_runs import labelled_grounds
 from terrafusion.fusion.training.policy_fit import LoggedSamples
 
 MEAN_S = 6.0
@@ -85,7 +85,7 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
 
 def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str, GroundSamples]:
     """Samples of a recorded run by ground."""
-    motion, grounds = motion_of(recording, vehicle), grounds_of(recording)
+    motion, grounds = motion_of(recording, vehicle), labelled_grounds(recording)
     names = np.array([_ground_around(t, grounds) for t in motion.t_ns.tolist()])
     found = {}
     for ground in sorted(set(names.tolist()) - {"", UNKNOWN}):
@@ -97,21 +97,6 @@ def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str
         none = np.empty(0)
         found[ground] = GroundSamples(*slip, none, yaw, side, none, none, none, none)
     return found
-
-
-def grounds_of(recording: Recording) -> list[tuple[int, str]]:
-    """Start (ns) and name of each ground of a labelled run; "" is no label.
-
-    Raises:
-        DataError: the recording has no annotated or simulated ground.
-    """
-    if grounds := true_grounds(recording):
-        return grounds
-    raise DataError(
-        f"{recording.name}: no ground label",
-        channel="terrain",
-        remedy="name it in meta.yaml ('terrain'), or add terrain.csv",
-    )
 
 
 def _ground_around(t_ns: int, grounds: list[tuple[int, str]]) -> str:

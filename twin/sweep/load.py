@@ -55,7 +55,7 @@ class Levels(Parsed):
         if not isinstance(raw, list) or not 0 < len(raw) <= MAX_LEVELS:
             remedy = f"give a list of 1 to {MAX_LEVELS} values, or {{from, to, count}}"
             raise RejectedError(f"'{{key}}' is '{shown(raw)}'", remedy)
-        levels = tuple(_part(f"[{i}]", self.quantity, value) for i, value in enumerate(raw))
+        levels = tuple(self.quantity.parse_part(value, f"[{i}]") for i, value in enumerate(raw))
         if len(set(levels)) < len(levels):
             twice = next(x for x in levels if levels.count(x) > 1)
             raise RejectedError(f"'{{key}}' has {shown(twice)} twice", "name each level once")
@@ -69,7 +69,7 @@ class Levels(Parsed):
         for name in ("from", "to"):
             if name not in raw:
                 raise RejectedError(f"'{{key}}.{name}' is missing", "add it")
-        given = {name: _part(f".{name}", ends[name], value) for name, value in raw.items()}
+        given = {name: ends[name].parse_part(value, f".{name}") for name, value in raw.items()}
         low, high, count = given["from"], given["to"], given.get("count")
         if low >= high:
             raise RejectedError(
@@ -199,13 +199,6 @@ def _axes(raw: dict[str, Any], vehicle: VehicleParams, file: str) -> tuple[Axis,
     if errors:
         raise ConfigError.joined(errors)
     return tuple(axes)
-
-
-def _part(suffix: str, quantity: Quantity, raw: Any) -> Any:
-    try:
-        return quantity.parse(raw)
-    except RejectedError as error:
-        raise error.inside(suffix) from None
 
 
 def _near(name: str, folder: Path) -> str:

@@ -17,7 +17,7 @@ from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics.baselines import Baselines, OutageBaseline
 from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import Outage, OutageScore, score
-from terrafusion.fusion.metrics.verdict import Verdict, _fix_sigma_m, _longest, judge
+from terrafusion.fusion.metrics.verdict import Verdict, _fix_sigma_m, judge
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.verdicts import FAULTS, is_wrong, short_drive
 
@@ -343,12 +343,6 @@ def test_the_sigma_of_fixes_is_the_typical_horizontal_one() -> None:
     sigma = np.array([[0.1, 0.3, 9.0], [0.4, 0.2, 9.0], [2.0, 1.0, 9.0], [np.inf, 1.0, 9.0]])
     assert _fix_sigma_m(SimpleNamespace(sigma_enu_m=sigma)) == 0.4  # type: ignore[arg-type]
     assert _fix_sigma_m(None) == 0.0
-
-
-def test_the_longest_run_is_the_first_of_those_as_long() -> None:
-    assert _longest([True, False, True, True, False, True, True]) == (2, 4)
-    assert _longest([False]) is None
-    assert _longest([True]) == (0, 1)
 
 
 def test_wild_fixes_that_were_rejected_do_not_count_as_agreement(drive):
