@@ -56,11 +56,7 @@ class TwinInput:
 
 
 def twin_input(recording: Recording, vehicle: VehicleParams, source: str) -> TwinInput:
-    """The input from one of `SOURCES`.
-
-    Raises:
-        DataError: the log does not have it, or its vehicle steers.
-    """
+    """The input from one of `SOURCES`; a DataError where the log lacks it, or its vehicle steers."""
     if vehicle.steered() is not None:
         raise DataError(
             f"drive type {vehicle.drive.type}: the twin is held against logs of robots without steering only",
@@ -125,7 +121,7 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     if after_ns > 86_400 * 10**9:
         raise DataError(
             f"the log goes on for {after_ns * 1e-9:.0f} s after its last command: its clocks differ",
-            file=recording.name, channel="command", remedy="try --stamps receive",
+            file=recording.name, channel="command", remedy="try --stamps receipt",
         )  # fmt: skip
     count = round((max(ends) - start) * 1e-9 / DT_S) + 1
     grid: Array = DT_S * np.arange(float(count))
