@@ -203,7 +203,6 @@ def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> ForceHea
     """How the horizontal specific force answers the changes of speed and the turns.
 
     Args:
-        context: gives the wheels and the IMU's times.
         accel: (N, 2) horizontal specific force, m/s2, the second axis left of the first.
         yaw_rate: (N,) about the upward axis, rad/s.
 
@@ -382,7 +381,8 @@ def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repa
 
 def _axes_for(context: CheckContext, imu: Imu, up: str, alone: bool) -> tuple[Axes, str]:
     """The axes with z `up` that the run determines, else those nearest to the log's; and which it was."""
-    choices = [axes for axes in _all_axes() if axes[2] == up]
+    orders = (axes for axes in permutations(AXES, 3) if axes[2] == up)
+    choices = [axes for axes in orders if np.linalg.det(np.array([AXES[name] for name in axes])) > 0.5]
     nearest = max(choices, key=lambda axes: (np.trace(axes_matrix(axes)), axes[0] == "+x"))
     R = axes_matrix(nearest)
     accel = imu.accel_mps2 @ R.T
@@ -394,11 +394,6 @@ def _axes_for(context: CheckContext, imu: Imu, up: str, alone: bool) -> tuple[Ax
     turn = np.linalg.matrix_power(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarter)
     axes = next(a for a in choices if np.allclose(axes_matrix(a), turn @ R))
     return axes, f"; acceleration follows the wheels along {axes[0]}"
-
-
-def _all_axes() -> list[Axes]:
-    """The 24 right-handed assignments of sensor axes to the body's."""
-    return [a for a in permutations(AXES, 3) if np.linalg.det(np.array([AXES[name] for name in a])) > 0.5]
 
 
 def _turned(recording: Recording, axes: Axes, *, gyro: bool) -> Recording:

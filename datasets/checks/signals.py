@@ -314,7 +314,7 @@ def check_missing(context: CheckContext) -> Iterator[Finding]:
         if name not in ("command", "wheels", "imu", "motor") or len(channel) < STUCK_ROWS:
             continue
         if isinstance(channel, Wheels) and sampled_apart(channel):
-            continue  # see sides.check_apart
+            continue  # see wheels.check_apart
         columns = {c: np.isnan(v) for c, v in channel.columns().items() if v.dtype.kind == "f"}
         share = {column: float(empty.mean()) for column, empty in columns.items() if not empty.all()}
         if not share or max(share.values()) <= MISSING_SHARE:

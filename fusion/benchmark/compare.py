@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, ORACLE
 from terrafusion.fusion.benchmark.run_score import RunScore
@@ -137,11 +136,6 @@ def known_median(values: Sequence[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def resampled(values: Array) -> Array:
-    """Medians (R, k) of columns of `values` (n, k) over bootstrap samples of its rows."""
-    return np.asarray(np.median(values[resampled_rows(len(values), RESAMPLES, SEED)], axis=1))
-
-
 def median_interval(values: Sequence[float]) -> tuple[float, Interval | None]:
     """Median of independent values, and its interval from `LEAST_UNITS` values on."""
     ordered = sorted(values)
@@ -181,7 +175,7 @@ def _share(errors: Errors) -> tuple[float | None, Interval | None]:
     share = float(gain_own / gain_best)
     if len(units) < LEAST_UNITS:
         return share, None
-    gains = 1.0 - np.exp(resampled(logs))
+    gains = 1.0 - np.exp(np.median(logs[resampled_rows(len(logs), RESAMPLES, SEED)], axis=1))
     if (gains[:, 1] <= 0.0).mean() > 0.5 * (1.0 - CONFIDENCE):
         return share, None
     samples = gains[:, 0] / np.maximum(gains[:, 1], 1e-9)

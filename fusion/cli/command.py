@@ -20,7 +20,6 @@ from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.common import PROGRESS, HowRead, Line, styled
 from terrafusion.fusion.cli.outputs import Output, check_file, parts_of
 
-PANEL = "Options of all commands"
 INTERRUPTED = 130
 
 
@@ -47,19 +46,14 @@ class Result:
     vehicle: Any = None
 
 
+_shared = functools.partial(typer.Option, rich_help_panel="Options of all commands")
 FLAGS = {
-    "quiet": ("--quiet", "-q", "Print one line and errors."),
-    "verbose": ("--verbose", "Print details, all options, and where an error arose."),
-    "as_json": ("--json", "Print one JSON document, all else to stderr."),
-    "force": ("--force", "Replace what this command did not write."),
+    "quiet": _shared("--quiet", "-q", help="Print one line and errors."),
+    "verbose": _shared("--verbose", help="Print details, all options, and where an error arose."),
+    "as_json": _shared("--json", help="Print one JSON document, all else to stderr."),
+    "force": _shared("--force", help="Replace what this command did not write."),
 }
-"""Names and help of the options that commands share."""
-
-
-def _flag(described: Sequence[str]) -> Any:
-    """The annotation of one of `FLAGS`."""
-    *names, help = described
-    return Annotated[bool, typer.Option(*names, help=help, rich_help_panel=PANEL)]
+"""The options that commands share."""
 
 
 def add_command(
@@ -114,7 +108,9 @@ def add_command(
 
     command.__doc__ = about
     asked = [
-        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_flag(FLAGS[word]))
+        inspect.Parameter(
+            word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, FLAGS[word]]
+        )
         for word in shared
     ]
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)

@@ -89,8 +89,7 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
             continue
         if "value" not in entry:
             _overridden(entry, value)
-        elif entry["value"] != (list(value) if isinstance(value, tuple) else value):
-            plain = list(value) if isinstance(value, tuple) else value
+        elif entry["value"] != (plain := list(value) if isinstance(value, tuple) else value):
             raw[name] = _entry(entry, plain, "as the log says")
 
 

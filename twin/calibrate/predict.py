@@ -99,10 +99,8 @@ def _directions(log: PreparedLog, model: Model, plant: Plant, names: Sequence[st
     """The named numbers, then x, y and yaw of a start."""
     effects = [name.removeprefix("effects.") for name in names if name.startswith("effects.")]
     d = Directions.zeros(plant, len(names) + len(POSE), effects)
-    ends = [
-        label for label in log.labels for _ in range(2)
-    ]  # of each ground; those of the route are no knots
-    knots = ends[1:-1] if len(log.labels) > 1 else log.labels
+    ends = np.repeat(log.labels, 2).tolist()  # of each ground; those of the route are no knots
+    knots = ends[1:-1] if len(log.labels) > 1 else ends[:1]
     for m, name in enumerate(names):
         if name.startswith("effects."):
             d.effects[name.removeprefix("effects.")][m] = 1.0

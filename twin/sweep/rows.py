@@ -12,7 +12,6 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.json_text import finite
-from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.speeds import speed_errors
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.engine.integrate import raise_if_diverged
@@ -130,7 +129,8 @@ def _with_sensors(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row | Excep
     def sensed(case: SweepPoint) -> Row:
         run = simulate_run(**arguments(sweep, case))
         row = _results(run.t_s, run.commanded, run.states, run.summary, sweep.vehicle)
-        return row | _sensor_errors(run.recording, sweep.vehicle)
+        errors = speed_errors(run.recording, sweep.vehicle.odometry.wheel_radius_m)
+        return row | {f"{name}_error_pct": error for name, error in errors.items()}
 
     return [attempt(sensed, case) for case in cases]
 
@@ -196,11 +196,6 @@ def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float:
     """Angle the robot turned by its wheels' angles, rad."""
     left, right = (states[-1] - states[0])[state_slice("wheel_angle")].reshape(2, 2).mean(axis=0)
     return float(right - left) * vehicle.odometry.wheel_radius_m / vehicle.odometry.track_m
-
-
-def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
-    errors = speed_errors(recording, vehicle.odometry.wheel_radius_m)
-    return {f"{name}_error_pct": error for name, error in errors.items()}
 
 
 def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:

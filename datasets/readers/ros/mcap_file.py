@@ -39,11 +39,7 @@ _head = struct.Struct("<BQ").unpack_from
 
 
 class McapFile:
-    """An open MCAP file.
-
-    Raises:
-        BagError: the file breaks the format.
-    """
+    """An open MCAP file; a BagError where it breaks the format."""
 
     def __init__(self, path: Path) -> None:
         self._file, self._end = path.open("rb"), path.stat().st_size
@@ -84,7 +80,10 @@ class McapFile:
         try:
             for record in self._records():
                 for inner in _inside(record) if isinstance(record, Chunk) else (record,):
-                    self._learn(inner)
+                    if isinstance(inner, Schema):
+                        self._schemas[inner.id] = inner
+                    elif isinstance(inner, Channel):
+                        self._channels[inner.id] = inner
                 complete += 1
         except Exception:  # the library has many for a record that breaks off
             if not self.cut:
@@ -95,12 +94,6 @@ class McapFile:
         for batch in self.batches([[number] for number in channels]):
             counts[channels[batch.group]] += len(batch.starts)
         return counts
-
-    def _learn(self, record: McapRecord) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self._channels[record.id] = record
 
     def _source(self, number: int) -> BagSource:
         channel = self._channels[number]

@@ -47,7 +47,8 @@ Placed = tuple[Array | None, list[str]]
 
 def claims(path: Path, head: bytes) -> bool:
     """Whether it is a MATLAB v7.3 file with the rover's variables, or one that cannot be opened."""
-    if not is_hdf5(head) or not path.is_file():
+    begins = (head, head[USER_BLOCK:])  # of the HDF5, without or with MATLAB's text before it
+    if not any(begin.startswith(MAGIC) for begin in begins) or not path.is_file():
         return False
     names = variables(path)
     return path.suffix == ".mat" if names is None else names >= NEEDED
@@ -241,11 +242,6 @@ USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
 
 
-def is_hdf5(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of HDF5, with or without MATLAB's text before it."""
-    return head.startswith(MAGIC) or head[USER_BLOCK : USER_BLOCK + len(MAGIC)] == MAGIC
-
-
 def variables(path: Path) -> set[str] | None:
     """Names of the variables, or None where the file cannot be opened."""
     try:
@@ -257,11 +253,7 @@ def variables(path: Path) -> set[str] | None:
 
 @contextmanager
 def opened(path: Path) -> Iterator[MatlabFile]:
-    """The file, open for reading.
-
-    Raises:
-        DataError: it cannot be opened or read, here or while it is open.
-    """
+    """The file, open for reading; a DataError where it cannot be opened or read, here or while it is open."""
     try:
         with _file(path) as file:
             yield MatlabFile(file)

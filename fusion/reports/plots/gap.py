@@ -62,10 +62,8 @@ def plot_causes(sheet: Sheet, d: GapDiagnosis) -> None:
 
 
 def plot_paths(sheet: Sheet, d: GapDiagnosis, most: int) -> list[str]:
-    """Path of each judged run, coloured by the error of the first place's channel, its regime ringed.
-
-    Returns:
-        The keys of the figures.
+    """Path of each judged run, coloured by the error of the first place's channel, its regime ringed; gives
+    the keys of the figures.
     """
     from bokeh.models import ColorBar, LinearColorMapper
     from bokeh.palettes import Inferno256
@@ -80,7 +78,9 @@ def plot_paths(sheet: Sheet, d: GapDiagnosis, most: int) -> list[str]:
         plot.line(at[:, 0], at[:, 1], "path", style.NEUTRAL, width=1.0)
         if place is not None:
             index = [r for r, _ in REGIMES].index(place.regime)
-            known = np.interp(t_s, run.time_s[np.argsort(run.time_s)], _in_regime(d, run, index)) > 0.5
+            order = np.argsort(run.time_s)
+            inside = (regimes(run, d.evidence.model) == index).astype(float)
+            known = np.interp(t_s, run.time_s[order], inside[order]) > 0.5
             plot.dots(at[known, 0], at[known, 1], place.regime, style.TRUTH_ON_ANY, "ring", 10.0)
         colour = {"field": "error", "transform": mapper}
         tips = {f"{name}, {CHANNEL_UNITS[name]}": "@error{0.###}", "time, s": "@t{0.#}"}
@@ -92,10 +92,6 @@ def plot_paths(sheet: Sheet, d: GapDiagnosis, most: int) -> list[str]:
         plot.panel.figure.title = Path(run.name).name
         plot.panel.figure.title.text_color = style.NEUTRAL
     return [f"path{i}" for i in range(len(runs))]
-
-
-def _in_regime(d: GapDiagnosis, run: WhitenedRun, index: int) -> Array:
-    return (regimes(run, d.evidence.model) == index).astype(float)[np.argsort(run.time_s)]
 
 
 def _place_errors(d: GapDiagnosis, i: int, name: str) -> tuple[Array, Array, Array]:
