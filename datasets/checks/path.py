@@ -114,11 +114,7 @@ def driven_and_turned(
 
 
 def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, Array, Complex] | None:
-    """The path by wheels and gyro z; straight without a gyro.
-
-    Args:
-        context: the recording and its wheel radius.
-        point_m: position in the body (forward + i left) whose path is wanted.
+    """The path of a point of the body (forward + i left, m) by wheels and gyro z; straight without a gyro.
 
     Returns:
         Times (N,) s since the start, distance rolled (N,) m, and positions (N,) m, east + i north, of

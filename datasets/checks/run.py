@@ -81,11 +81,7 @@ SEVERAL = ("wheel-odd", "clock-jump")
 
 
 def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
-    """All findings of all checks, errors first.
-
-    Args:
-        rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
-    """
+    """All findings, errors first; without `rig` wheel rates (rad/s) are not compared with GNSS speed."""
     with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN and huge numbers warn
         return _findings(CheckContext(recording, rig))
 

@@ -79,11 +79,7 @@ def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "", compl
 
 
 def refuse(problems: Iterable[tuple[str, str]], file: Path | str) -> None:
-    """Raises what is wrong with a file beyond its single values, as (what, remedy), if anything is.
-
-    Raises:
-        ConfigError: there is a problem.
-    """
+    """Refuse a file (ConfigError) for what is wrong beyond its single values, as (what, remedy)."""
     errors = [ConfigError(what, file=file, remedy=remedy) for what, remedy in problems]
     if errors:
         raise ConfigError.joined(errors)

@@ -38,11 +38,7 @@ def expanded(text: str | Path) -> Path:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse an unusable output folder before anything is computed; a missing one is not created yet.
-
-    Raises:
-        DataError: it cannot be made or written.
-    """
+    """Refuse an output folder that cannot be made or written (DataError) before any work; it is not made."""
     try:
         there = next(place for place in (path, *path.absolute().parents) if place.exists())
         tempfile.TemporaryFile(dir=there).close()

@@ -41,11 +41,7 @@ def too_much(what: str, most: float, remedy: str = "split it") -> DataError:
 
 
 def check_table(rows: int, columns: int, packed_bytes: int) -> None:
-    """Refuse a table of too many rows, columns or values, or far more of them than its bytes account for.
-
-    Raises:
-        DataError: it is too large.
-    """
+    """Refuse too many rows, columns or values, or far more than the file's bytes account for (DataError)."""
     check_columns(columns)
     if rows > ROWS:
         raise too_much("rows", ROWS)
@@ -55,31 +51,19 @@ def check_table(rows: int, columns: int, packed_bytes: int) -> None:
 
 
 def check_columns(columns: int) -> None:
-    """Refuse a table of too many columns.
-
-    Raises:
-        DataError: it has.
-    """
+    """Refuse a table of too many columns (DataError)."""
     if columns > COLUMNS:
         raise too_much("columns", COLUMNS, "keep those that are needed")
 
 
 def check_expansion(unpacked_bytes: int, packed_bytes: int) -> None:
-    """Refuse a file that unpacks to far more bytes than it has.
-
-    Raises:
-        DataError: it does.
-    """
+    """Refuse a file that unpacks to far more bytes than it has (DataError)."""
     if unpacked_bytes > FREE_BYTES + EXPANSION * packed_bytes:
         raise too_much("times its size when unpacked", EXPANSION, "is it a recording?")
 
 
 def within(parts: Iterable[bytes], packed_bytes: int) -> Iterator[bytes]:
-    """The unpacked parts of a file, as long as they are not far more bytes than it has.
-
-    Raises:
-        DataError: then.
-    """
+    """The unpacked parts of a file; a DataError once they are far more bytes than the file has."""
     total = 0
     for part in parts:
         total += len(part)

@@ -50,11 +50,7 @@ class Parsed(ABC):
 
     @abstractmethod
     def parse(self, raw: Any) -> Any:
-        """The value of a field, checked and converted.
-
-        Raises:
-            RejectedError: it is not allowed.
-        """
+        """The value of a field, checked and converted; a RejectedError where it is not allowed."""
 
     def parse_part(self, raw: Any, suffix: str) -> Any:
         """`parse` for a part of a value, whose errors add `suffix` to the key."""
@@ -99,11 +95,7 @@ class Quantity(Parsed):
         return self.allowed()
 
     def parse(self, raw: Any) -> float | tuple[float, ...]:
-        """`raw` as float (or tuple of floats) when it has the type and the range.
-
-        Raises:
-            RejectedError: otherwise.
-        """
+        """`raw` as float (or tuple of floats); a RejectedError unless it has the type and the range."""
         items = list(raw) if self.size and isinstance(raw, (list, tuple)) else [raw]
         numeric = all(isinstance(x, Real) and not isinstance(x, bool) for x in items)
         if not numeric or len(items) != (self.size or 1):
@@ -220,11 +212,7 @@ Switch = Annotated[bool, _Truth()]
 def checked_number(
     value: Any, quantity: Quantity, *, file: Path | str, key: str
 ) -> float | tuple[float, ...]:
-    """`value` as float (or tuple of floats) when it has the type and range of `quantity`.
-
-    Raises:
-        ConfigError: otherwise.
-    """
+    """`value` as float (or tuple of floats); a ConfigError unless it has the type and range of `quantity`."""
     try:
         return quantity.parse(value)
     except RejectedError as error:

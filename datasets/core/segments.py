@@ -28,11 +28,7 @@ class Cut:
     every_s: float | None = None
 
     def of(self, recording: Recording) -> list[Recording]:
-        """The selected segments of a recording.
-
-        Raises:
-            DataError: there is none.
-        """
+        """The selected segments of a recording; a DataError where there is none."""
         if self.every_s is not None:
             return segments_of(recording, self.every_s)
         assert self.begin_s is not None

@@ -55,11 +55,7 @@ def unwrapped_beside_speeds(angle_rad: Array | None, names: tuple[str, ...]) -> 
 
 
 def unwrapped_alone(angle_rad: Array, names: tuple[str, ...], channel: str) -> tuple[Array, str]:
-    """As `unwrapped`, of a log without speeds.
-
-    Raises:
-        DataError: steps are too large to tell.
-    """
+    """As `unwrapped`, of a log without speeds; a DataError where steps are too large to tell."""
     angle, note = unwrapped(angle_rad, names)
     if angle is None:
         remedy = "log wheel speeds, angles that count whole turns, or more samples a second"

@@ -63,8 +63,7 @@ def _loaded(text: str, path: Path) -> Any:
 def dump_yaml(path: Path, content: Mapping[str, Any], **settings: Any) -> Path:
     """Write a mapping in the order of its keys; `settings` are attributes of ruamel's `YAML`.
 
-    Raises:
-        TerrafusionError: the file cannot be written.
+    A TerrafusionError where the file cannot be written.
     """
     from ruamel.yaml import YAML
 

@@ -169,11 +169,7 @@ def _check_size(data: bytes, packed: int) -> None:
 
 
 def check_lines(data: bytes) -> None:
-    """Refuse a line that is too long for one.
-
-    Raises:
-        DataError: there is one.
-    """
+    """Refuse a line that is too long for one (DataError)."""
     begin = 0
     while len(data) - begin > limits.LINE_BYTES:
         end = data.rfind(b"\n", begin, begin + limits.LINE_BYTES) + 1
@@ -219,7 +215,6 @@ def read_columns(
 
     Args:
         text: of the file, by `read_text`.
-        layout: how its rows are written.
         numbers: columns of numbers; empty and NaN cells are missing values.
 
     Raises:

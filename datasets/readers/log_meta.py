@@ -104,7 +104,7 @@ class Meta(MetaFile):
 
 
 def parse_meta(content: dict[str, Any], path: Path) -> Meta:
-    """Check the keys and values of `meta.yaml`, as read from the file `path`.
+    """The keys of `meta.yaml`, as read from the file `path`.
 
     Raises:
         ConfigError: missing key, wrong type, value out of range; names key and remedy.

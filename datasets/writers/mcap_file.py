@@ -46,7 +46,6 @@ def write_mcap_file(
     """Write all messages in the order of their times; of equal times in the order of the topics.
 
     Args:
-        path: the file, which is replaced.
         topics: at least one with messages, at most 65535; empty ones stay as channels.
         definitions: by message type.
         library: name of the writer, for the header.

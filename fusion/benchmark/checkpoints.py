@@ -24,11 +24,7 @@ LIBRARIES = ("casadi", "gtsam", "numpy", "scipy")
 def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") -> dict[str, Any]:
     """Store the result of the part `key`, the name of its file; returns it as `read_part` does.
 
-    Args:
-        state: of the files that it depends on, such as `log_state`.
-
-    Raises:
-        TerrafusionError: the folder cannot be written.
+    `state` is that of the files it depends on, such as `log_state`. TerrafusionError: it cannot be written.
     """
     text = to_json({"sources_sha256": sources_sha256(), "state": state, **content})
     write_atomically(_file(out, key), lambda part: part.write_text(text, encoding="utf-8"))

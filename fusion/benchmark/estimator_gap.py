@@ -51,10 +51,7 @@ class Compared:
 
 
 def estimator_scorer(vehicle: str) -> Scorer:
-    """A function that replays a log and scores it; the reference pose of the log is not used.
-
-    Args:
-        vehicle: name or YAML file, as `terrafusion replay` takes it.
+    """A function that replays a log with a vehicle, by name or file, and scores it without reference pose.
 
     The error is that against every fifth fix, which the estimator is not given; a log without GNSS has none.
     A squared innovation (NIS) of one a degree of freedom is what its own covariance says.
@@ -118,11 +115,9 @@ def _mean(group: Sequence[LogScores], name: str) -> float | None:
 def twin_of(
     recording: Recording, log: PreparedLog, model: Model, effects: Mapping[str, float], seed: int
 ) -> Recording:
-    """The twin's log of a drive: the channels the recording has, no truth, noise by the vehicle's file.
+    """The twin's log of a prepared drive: the recording's channels, no truth, noise by the vehicle file.
 
-    Args:
-        log: the prepared recording: inputs and soil.
-        effects: on top of the model's own.
+    `effects` are added to the model's own.
     """
     run = simulate_run(
         scenario_of(log, model), vehicle=model.vehicle, soils=model.soils, seed=seed,

@@ -112,11 +112,7 @@ def check_stamps(stamps: str) -> str:
 
 
 def load_rig(vehicle: str | None) -> Rig | None:
-    """The sensor geometry of a vehicle; None without one.
-
-    Raises:
-        ConfigError: no such vehicle.
-    """
+    """The sensor geometry of a vehicle, None without one; a ConfigError where there is no such vehicle."""
     if vehicle is None:
         return None
     from terrafusion.twin.model.vehicle import load_vehicle
@@ -237,11 +233,7 @@ def write_log(recording: Recording, out: Path, rig: Rig | None = None) -> list[s
 
 
 def refuse_no_yaml(out: Path) -> None:
-    """Refuse a name for a vehicle file that is none of a YAML file.
-
-    Raises:
-        ConfigError: naming it.
-    """
+    """Refuse a name for a vehicle file that is none of a YAML file (ConfigError)."""
     from terrafusion.datasets.core.errors import ConfigError
 
     if out.suffix not in (".yaml", ".yml"):
@@ -249,11 +241,7 @@ def refuse_no_yaml(out: Path) -> None:
 
 
 def refuse_impossible(log: str, recording: Recording) -> None:
-    """Refuse a log with numbers beyond anything possible.
-
-    Raises:
-        DataError: the first of them.
-    """
+    """Refuse a log with numbers beyond anything possible: a DataError of the first."""
     from terrafusion.datasets.checks import CheckContext, check_magnitude
 
     _refuse(log, list(check_magnitude(CheckContext(recording, None))))

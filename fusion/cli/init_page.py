@@ -34,10 +34,7 @@ def interactive() -> bool:
 
 
 def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
-    """List the topics of a bag, and let the user choose among several sensors of a kind.
-
-    Returns:
-        topic by channel, as given and as chosen.
+    """The topics given, and those the user chooses among several sensors of a kind, by channel.
 
     Raises:
         DataError: several of a kind, and nobody to ask.

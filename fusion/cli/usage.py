@@ -38,11 +38,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def refuse_options(given: Mapping[str, bool], why: str) -> None:
-    """Options that would have no effect are wrong usage (exit status 2).
-
-    Args:
-        given: whether it was given, by option.
-    """
+    """Options that were given but would have no effect are wrong usage (exit status 2)."""
     for option, is_given in given.items():
         if is_given:
             raise typer.BadParameter(why, param_hint=option)

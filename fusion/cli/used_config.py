@@ -19,14 +19,10 @@ PACKAGES = ("gtsam", "casadi", "numpy", "scipy")
 
 
 def write_config(out: Path, command: str, given: Mapping[str, Any], vehicle: Any) -> None:
-    """Write `config.json` into the folder `out`.
+    """Write `config.json` into the folder `out`; `given` are the options with their defaults in place.
 
-    Args:
-        given: the options with their defaults in place.
-        vehicle: `VehicleParams` of the run; None where `given` names it, or where there are many.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
+    `vehicle` is the `VehicleParams` of the run; None where `given` names it, or where there are many. A
+    TerrafusionError where the file cannot be written.
     """
     if vehicle is None and given.get("vehicle") is not None:
         from terrafusion.twin.model.vehicle import load_vehicle

@@ -80,11 +80,9 @@ def baselines(
     antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0),
     aligned: bool = False,
 ) -> Baselines:
-    """Both baselines of a run, scored as `scores` were.
+    """Both baselines of a run, scored as `scores` were; `used` are the fixes the estimator was given.
 
-    Args:
-        used: the fixes the estimator was given.
-        aligned: the estimate is local and was moved to the start of the reference, as `score` does.
+    `aligned` is a local estimate that was moved to the start of the reference, as `score` does.
     """
     errors = scores.errors
     if errors is None or not np.isfinite(errors.reference_m).any():

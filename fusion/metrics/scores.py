@@ -66,8 +66,7 @@ class Outage:
     def scored(self, errors: Errors, end_ns: int, start_ns: int) -> Rows:
         """Rows (n,) of the references inside, none where they end long before it does.
 
-        Args:
-            end_ns: time of the last keyframe: an outage ends there at the latest.
+        An outage ends at the latest with the last keyframe, `end_ns`.
         """
         rows = np.flatnonzero(self.covers(errors.t_ns, start_ns))
         if not len(rows):

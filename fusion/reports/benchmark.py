@@ -50,11 +50,7 @@ TICKS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 
 def write_benchmark(out: Path, result: BenchmarkResult, origin: Mapping[str, str]) -> list[Section]:
-    """All files but the parts; returns the tables.
-
-    Raises:
-        TerrafusionError: a file cannot be written.
-    """
+    """All files but the parts; returns the tables. A TerrafusionError where a file cannot be written."""
     sections = tables(result.rows)
     write_text(out / "benchmark.json", to_json(_content(result, origin), indent=1) + "\n")
     write_text(out / "benchmark.md", "\n".join(document_lines(sections, result, origin)) + "\n")
@@ -98,11 +94,7 @@ def write_document(
 
 
 def document_head(path: Path) -> str:
-    """What precedes the line `MARK` of a document.
-
-    Raises:
-        ConfigError: the file is not there, or has no such line.
-    """
+    """What precedes the line `MARK` of a document; a ConfigError where there is no such file or line."""
     try:
         head, mark, _ = path.read_text(encoding="utf-8").partition(MARK)
     except (OSError, ValueError):

@@ -25,11 +25,7 @@ CELL_PX = 19
 
 
 def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | None = None) -> None:
-    """`report.html` in the folder `out`.
-
-    Raises:
-        TerrafusionError: the folder cannot be written.
-    """
+    """`report.html` in the folder `out`; a TerrafusionError where that cannot be written."""
     sheet = Sheet()
     draw(sheet, scores)
     own = scores["figures"]["diagnosis"]

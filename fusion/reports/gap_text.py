@@ -24,9 +24,7 @@ TITLE = 9  # columns of a section's title
 def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = None) -> list[str]:
     """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next.
 
-    Args:
-        out: folder of the files.
-        corrected: vehicle file that was written.
+    `out` is the folder of the files, `corrected` the vehicle file that was written.
     """
     for most in range(MOST_PLACES, 0, -1):
         lines = _screen(d, out, corrected, most)
@@ -239,11 +237,7 @@ def effect_words() -> dict[str, list[str]]:
 
 
 def explanation(effect: str) -> list[str]:
-    """Lines about an effect: what it is, how to check it, its laws with typical sizes.
-
-    Raises:
-        ConfigError: no effect has this name.
-    """
+    """What an effect is, how to check it, its laws with typical sizes; a ConfigError for an unknown name."""
     forms = forms_of(effect)
     lines = [effect]
     if effect in effect_words():

@@ -8,14 +8,9 @@ from terrafusion.fusion.reports.page import VerdictBox, write_page
 
 
 def write_inspection(path: Path, page: Mapping[str, Any], lines: Sequence[str], command: str) -> Path:
-    """Write the report of a log to `path`.
+    """Write the report of a log: of `page`, what `terrafusion inspect --json` prints, and the other `lines`.
 
-    Args:
-        page: what `terrafusion inspect --json` prints.
-        lines: what `terrafusion inspect` prints, without the findings.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
+    A TerrafusionError where the file cannot be written.
     """
     found = page.get("findings", ())
     errors = sum(one["severity"] == "error" for one in found)

@@ -73,11 +73,7 @@ def write_page(
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text file, which appears when it is whole.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
-    """
+    """Write a text file, which appears when it is whole; a TerrafusionError where that fails."""
     return write_atomically(path, lambda part: part.write_text(text, "utf-8", "backslashreplace"))
 
 

@@ -140,11 +140,9 @@ def _baselines(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
 
 
 def tiles(rows: Sequence[ScoreRow], names: Sequence[str], ours: int) -> list[Tile]:
-    """The three numbers to see first: error, end of an outage, consistency; else what was scored.
+    """The three numbers of run `ours` to see first: error, end of an outage, consistency; else others.
 
-    Args:
-        names: of the runs.
-        ours: the run whose numbers they are; below stand those of the others and of the baselines.
+    Below each stand those of the other runs and of the baselines.
     """
     found: list[ScoreRow] = []
     for word in TILES:

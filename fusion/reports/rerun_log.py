@@ -39,11 +39,7 @@ GNSS_COLOUR, REJECTED_COLOUR, BODY_COLOUR = "#9a9a9a", "#111111", "#0072b2"
 
 
 def require_rerun() -> Any:
-    """The module `rerun`.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """The module `rerun`; a ConfigError where it is not installed."""
     try:
         import rerun
     except ImportError as absent:

@@ -41,14 +41,9 @@ _STATISTICS = (
 def write_sweep_report(
     out: Path, sweep: Sweep, table: Any, provenance: Mapping[str, object] | None = None
 ) -> Path:
-    """Write `report.html` into the folder of a finished sweep.
+    """Write `report.html` of a sweep and the pyarrow `Table` of `run_sweep` into its folder.
 
-    Args:
-        table: pyarrow `Table` of `run_sweep`.
-        provenance: further lines for the last section, such as the command line.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
+    `provenance` are further lines for the last section. A TerrafusionError where the file cannot be written.
     """
     columns = columns_of(table)
     sheet = Sheet()

@@ -33,10 +33,7 @@ class LoggedRun:
 
 
 def open_runs(logs: Sequence[str], vehicle: str | None = None) -> list[LoggedRun]:
-    """The labelled runs of one robot's logs: files, folders, or names of the catalogue.
-
-    Args:
-        vehicle: instead of what the logs say.
+    """The labelled runs of one robot's logs: files, folders, or catalogue names; `vehicle` instead of theirs.
 
     Raises:
         DataError: a run without ground labels, nothing that moves, or logs of several vehicles.
@@ -79,11 +76,7 @@ def run_of(recording: Recording, vehicle: str | None = None) -> LoggedRun:
 
 
 def labelled_grounds(recording: Recording) -> list[tuple[int, str]]:
-    """Start (ns) and name of each ground of a labelled run; "" is no label.
-
-    Raises:
-        DataError: the recording has no annotated or simulated ground.
-    """
+    """Start (ns) and name of each ground of a run, "" where unlabelled; a DataError without a true label."""
     if grounds := true_grounds(recording):
         return grounds
     remedy = "name it in meta.yaml ('terrain'), or add terrain.csv"

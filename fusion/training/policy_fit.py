@@ -128,11 +128,7 @@ def _noise_on(ground: str, samples: GroundSamples) -> SensorNoise:
 
 
 def noise_of(grounds: list[GroundSamples]) -> SensorNoise:
-    """Sensor noise of one ground, or of several with equal weight.
-
-    Raises:
-        ValueError: on a ground the wheels never turned.
-    """
+    """Sensor noise of one ground, or of several with equal weight; ValueError: the wheels never turned."""
     if any(len(e.slip_pairs) < 2 for e in grounds):
         raise ValueError("the wheels never turned long enough to estimate the slip")
     mean, per_grade = _slip_line(grounds)

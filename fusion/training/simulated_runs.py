@@ -149,11 +149,7 @@ class WheelSamples:
 
 
 def wheel_samples(recording: Recording) -> WheelSamples:
-    """Wheels and truth of a run.
-
-    Raises:
-        ValueError: the recording has no wheels, or no truth with a body twist.
-    """
+    """Wheels and truth of a run; a ValueError without wheels, or without a truth that has a body twist."""
     rig = load_vehicle(recording.vehicle or "elevate").rig()
     wheels, truth = recording.wheels, recording.truth
     if wheels is None or truth is None or truth.twist_body is None:

@@ -18,13 +18,9 @@ _SHRINK = 1e-3
 
 
 def fit_spectrum(levels: Mapping[str, Array]) -> SpectrumClassifier | None:
-    """The classifier, every ground as likely as another.
+    """The classifier, every ground as likely as another; None where the grounds have no level in common.
 
-    Args:
-        levels: ground -> (n, 42) of `band_levels`; a level that not every ground shows is not used.
-
-    Returns:
-        None where the grounds have no level in common.
+    `levels` are (n, 42) of `band_levels` by ground; a level that not every ground shows is not used.
     """
     from sklearn.linear_model import LogisticRegression
 

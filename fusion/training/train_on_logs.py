@@ -29,10 +29,7 @@ MIN_RUNS = 2
 
 
 def train_on(runs: Sequence[LoggedRun], inputs: dict[str, str], made_by: str = "") -> TerrainModel:
-    """A model of the robot of `runs`.
-
-    Args:
-        inputs: name -> SHA-256 of the files of the logs.
+    """A model of the robot of `runs`; `inputs` are the SHA-256 of the files of the logs by name.
 
     Raises:
         DataError: fewer than two grounds, a ground with a single run, or too little of one.
@@ -116,11 +113,7 @@ def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:
 
 
 def check_runs(runs: Sequence[LoggedRun]) -> None:
-    """Check that there are several grounds, each with runs to leave one out.
-
-    Raises:
-        DataError: there are not.
-    """
+    """Refuse fewer than two grounds, or one without a run to leave out (DataError)."""
     counts = Counter(ground for run in runs for ground in run.grounds())
     if len(counts) < 2:
         raise DataError("training needs at least two grounds", channel="terrain", remedy="give more logs")

@@ -42,11 +42,7 @@ class WindowStore:
         return [_window(row, samples) for row, samples in zip(numbers, parts, strict=True)]
 
     def write(self, number: int, windows: list[Window]) -> None:
-        """Store the windows of run `number`.
-
-        Raises:
-            TerrafusionError: the folder cannot be written.
-        """
+        """Store the windows of run `number`; a TerrafusionError where the folder cannot be written."""
         check_folder(self.folder)
         numbers = [[np.nan if (x := getattr(w, name)) is None else x for name in NUMBERS] for w in windows]
         imu = [np.column_stack([w.imu_t_s, w.gyro_radps, w.accel_mps2]) for w in windows]

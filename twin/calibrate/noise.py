@@ -98,8 +98,7 @@ def sheet_correlation(observed: Observed, lags: int) -> tuple[float, ...] | None
 def autoregressive(series: Sequence[tuple[Rows, Array]], lags: int) -> tuple[float, ...]:
     """Autocorrelation of the autoregressive process that fits the residuals best.
 
-    Args:
-        series: slots (n,) and residuals (n,) in units of their sigma, one pair a window.
+    `series` are slots (n,) and residuals (n,) in units of their sigma, one pair a window.
     """
     total = sum(len(values) for _, values in series)
     order = min(MAX_ORDER, total // 10)

@@ -70,9 +70,8 @@ def observe(
 ) -> tuple[Observed, ...]:
     """Every channel of the log that the twin can be compared with; times in seconds from `start_ns`.
 
-    Args:
-        wheels: whether the wheels are measurements (and not the twin's input).
-        truth: whether to use the log's reference pose.
+    `wheels` says whether the wheels are measurements (and not the twin's input), `truth` whether the log's
+    reference pose is one.
     """
     found: list[Observed] = []
     if wheels:

@@ -138,11 +138,7 @@ class Problem:
         )
 
     def blocks(self, point: Point) -> list[ResidualBlock]:
-        """Residuals and derivatives, in a fixed order.
-
-        Raises:
-            TerrafusionError: the twin diverges.
-        """
+        """Residuals and derivatives, in a fixed order; a TerrafusionError where the twin diverges."""
         rate = np.array([c.rate(float(x)) for c, x in zip(self.coordinates, point.w, strict=True)])
         model, out = self.model_at(point.w), []
         for i, (log, pose) in enumerate(zip(self.logs, point.pose, strict=True)):

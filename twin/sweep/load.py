@@ -78,11 +78,7 @@ class Levels(Parsed):
         return Span(float(low), float(high), count)
 
     def spread(self, span: Span) -> tuple[float, ...]:
-        """The levels of a span with a count.
-
-        Raises:
-            RejectedError: a level between the ends is not allowed.
-        """
+        """The levels of a span with a count; a RejectedError where one between the ends is not allowed."""
         # Twelve digits: 0.15, not 0.15000000000000002.
         numbers = [round(x, 12) for x in np.linspace(span.low, span.high, span.count or 0).tolist()]
         return tuple(self.quantity.parse(x) for x in numbers)  # type: ignore[misc]

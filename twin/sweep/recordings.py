@@ -14,11 +14,7 @@ FORMATS = ("folder", "mcap")
 
 
 def check_runs(sweep: Sweep, runs: Sequence[int]) -> None:
-    """Refuse numbers that are no runs of the sweep.
-
-    Raises:
-        ConfigError: naming the first of them.
-    """
+    """Refuse numbers that are no runs of the sweep; a ConfigError names the first of them."""
     for run in runs:
         if not 0 <= run < sweep.runs:
             raise ConfigError(

@@ -61,11 +61,7 @@ class RawMessage:
     receipt_ns: int
 
     def stream(self, fields: tuple[str, ...]) -> Stream:
-        """The fields of this message as a stream of one.
-
-        Raises:
-            BagError: it does not fit its definition.
-        """
+        """The fields of this message as a stream of one; a BagError where it does not fit its definition."""
         with broken_bag_on_error(self.topic):
             decoder = MessageDecoder(self.msgtype, live_types(self.msgtype), fields, True, self.topic)
             return _decoded(decoder, [self])

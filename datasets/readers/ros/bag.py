@@ -56,11 +56,7 @@ MOST_TEXT = 300
 def opened_bag(
     path: Path, open_container: Callable[[Path], BagContainer], remedy: str
 ) -> Iterator[BagContainer]:
-    """A bag of either ROS, open.
-
-    Args:
-        open_container: opens the file or folder.
-        remedy: what to do about a bag that does not open or breaks off.
+    """A bag of either ROS, opened by `open_container`; `remedy` is for one that does not open, or breaks off.
 
     Raises:
         DataError: a broken bag, also where that shows only while it is read.

@@ -44,11 +44,9 @@ def _fields_of(topic: BagTopic) -> tuple[str, ...]:
 
 
 def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagContents | None:
-    """Contents of a bag; None for a log of another format.
+    """Contents of a bag, by path or catalogue name; None for a log of another format.
 
-    Args:
-        log: path or catalogue name.
-        topics: what the user has chosen, by channel.
+    `topics` is what the user has chosen, by channel.
 
     Raises:
         DataError: no such log, a broken bag, or a topic asked for that is not there.

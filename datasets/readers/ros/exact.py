@@ -71,11 +71,7 @@ class SavedChannels:
 def restore(
     read: Callable[[Mapping[Key, tuple[str, ...]]], Mapping[Key, Stream]], there: Collection[Key], file: Path
 ) -> Recording:
-    """The recording that was written into a bag.
-
-    Args:
-        read: gives the streams of topics with the wanted fields.
-        there: the topics of the bag.
+    """The recording that was written into a bag with the topics `there`; `read` gives streams of fields.
 
     Raises:
         DataError, ConfigError: the bag is not as this library writes it.

@@ -125,11 +125,7 @@ def normal_type(name: str) -> str:
 
 
 def numbers_at(data: Bytes, places: Places, dtype: str) -> NDArray[Any]:
-    """Numbers of a dtype that lie at any, also uneven, places (n,).
-
-    Raises:
-        BagError: a place outside the data.
-    """
+    """Numbers of a dtype at any places (n,), also uneven ones; a BagError for a place outside the data."""
     kind = np.dtype(dtype)
     inside = len(data) - kind.itemsize + 1
     if places.size and (int(places.min()) < 0 or int(places.max()) >= inside):

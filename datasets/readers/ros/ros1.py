@@ -60,11 +60,7 @@ class _Chunk(NamedTuple):
 
 
 class Ros1File:
-    """An open ROS 1 bag.
-
-    Raises:
-        BagError: the file breaks the format.
-    """
+    """An open ROS 1 bag; a BagError where it breaks the format."""
 
     def __init__(self, path: Path) -> None:
         self._file, self._end, self.cut = path.open("rb"), path.stat().st_size, ""

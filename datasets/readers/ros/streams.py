@@ -87,11 +87,7 @@ class Stream:
         return len(shapes) == 1 and None not in shapes
 
     def column(self, path: str) -> NDArray[Any]:
-        """Values (N, ...) of a field.
-
-        Raises:
-            BagError: the messages' definition has no such field.
-        """
+        """Values (N, ...) of a field; a BagError where the messages' definition has none."""
         if not self.has(path):
             raise BagError(f"its messages have no '{path}', as {self.msgtype} should", self.topic)
         first = self.blocks[0].columns[path]
@@ -220,12 +216,7 @@ def _holds(held: Held | None, fields: tuple[str, ...]) -> bool:
 def decode_streams(
     container: BagContainer, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
 ) -> dict[Key, Stream]:
-    """The streams of topics, in one go over the file.
-
-    Args:
-        asked: paths of the wanted fields by topic and type.
-        enough: stop when one topic has so many messages.
-    """
+    """The streams of topics (fields by topic and type) in one go; stops once one has `enough` messages."""
     decoders: list[tuple[Key, MessageDecoder]] = []
     groups: list[list[int]] = []
     for key, fields in asked.items():

@@ -33,16 +33,13 @@ class StreamTimes:
 
 
 def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool) -> StreamTimes:
-    """Times of every stream on one clock.
+    """Times of every stream on one clock; the streams are in the order of the file.
 
     Header stamps are used unless `stamps` is "receipt", or they are all zero, or the topics'
     header clocks do not agree. Messages without a header then take their receipt time, brought
     onto the header clock when the two clocks are more than a second apart.
 
-    Args:
-        streams: by channel, in the order of the file.
-        stamps: "header" or "receipt".
-        repair_clock: take steps of the clock out, and sort messages out of order, instead of refusing.
+    With `repair_clock` steps of the clock are taken out, and messages out of order sorted.
 
     Raises:
         DataError: stamps that run backwards, or header stamps that are zero in part.

@@ -228,13 +228,7 @@ _LIKELY = re.compile(r"wheel|vel|speed|motor|enc|tick|rpm|odo|drive", re.IGNOREC
 def wheel_advice(
     bag: Sequence[BagTopic], taken: Sequence[str], joints_of: Callable[[str], Sequence[str]]
 ) -> str:
-    """A note for a bag without wheels.
-
-    Args:
-        bag: topics with messages.
-        taken: topics of other sensors.
-        joints_of: joints of a JointState topic.
-    """
+    """A note for a bag without wheels; other sensors have taken the topics `taken`."""
     others = [topic for topic in bag if topic.name not in taken and not _NEVER.search(topic.msgtype)]
     usable = [topic for topic in others if topic.msgtype in TYPES["wheels"]]
     parts = [*_named(usable, joints_of)]

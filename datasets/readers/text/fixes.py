@@ -66,11 +66,7 @@ def gnss_channel(
 def gnss_recording(
     request: Request, fixes: Fixes, datum: Datum | None, source: str, notes: Sequence[str], times: RowTimes
 ) -> Recording:
-    """The recording of a log that holds nothing but fixes, with what `gnss_channel` notes behind `notes`.
-
-    Raises:
-        DataError: no row holds a fix.
-    """
+    """The recording of a log of fixes alone, with what `gnss_channel` notes; a DataError without a fix."""
     gnss, datum, more = gnss_channel(request, fixes, datum)
     if gnss is None:
         raise DataError("holds no fix", remedy="record it under open sky, or process it again")

@@ -110,11 +110,7 @@ class _Header:
 
 
 def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
-    """A first column map for these columns, on one line, for the user to correct.
-
-    Args:
-        first: cells of the first row, which tell a time's unit where its name does not.
-    """
+    """A first column map, on one line, for the user to correct; the first row's cells tell a time's unit."""
     headers = [_header(name) for name in names]
     time = next((h for h in headers if _TIME.search(h.base)), headers[0])
     channels: dict[str, dict[str, str]] = {}

@@ -131,12 +131,7 @@ def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, .
 
 
 def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
-    """The times of a file's rows as a recording needs them.
-
-    Args:
-        request: the file, and whether clocks are repaired.
-        channel: name of the channel or clock, for errors and jumps.
-        t_ns: (N,) int64 in the order of the rows.
+    """The times of a file's rows (N,), in their order, as a recording needs them; errors name the channel.
 
     Raises:
         DataError: time runs backwards, and no repair was asked for or none is possible.

@@ -33,13 +33,10 @@ def plot_biases(sheet: Sheet, estimate: Estimate) -> None:
 
 
 def plot_innovations(sheet: Sheet, estimate: Estimate) -> list[str]:
-    """For each sensor its normalised innovations, and below the mean of their squares in windows.
+    """For each sensor its normalised innovations, and below the mean of their squares in windows; their keys.
 
     Both with the band that holds 95 % where the covariance is consistent; that of the windows allows for
     the correlation of the samples. Crosses were rejected by a gate.
-
-    Returns:
-        The keys of the figures.
     """
     keys = []
     for whitened in consistency.innovations(estimate.innovations):

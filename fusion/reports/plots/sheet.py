@@ -199,9 +199,8 @@ class Plot:
     ) -> None:  # fmt: skip
         """Any of Bokeh's glyphs, whose columns are those of `data`; with `colour` None a column `colour`.
 
-        Args:
-            name: of the data, for the script.
-            more: columns for the script and for `tips`, what the pointer shows: label to "@column".
+        `name` is that of the data, for the script; `more` are columns for the script and for `tips`, what the
+        pointer shows: label to "@column".
         """
         from bokeh.models import ColumnDataSource, HoverTool
 
@@ -239,8 +238,7 @@ class Plot:
     ) -> None:  # fmt: skip
         """A heat map of values (rows, columns) over edges x (columns + 1,), y (rows + 1,); NaN is grey.
 
-        Args:
-            texts: what the pointer shows, row by row; by default the value and its place.
+        The pointer shows `texts`, row by row; by default the value and its place.
         """
         from bokeh.models import ColorBar, LinearColorMapper, LogColorMapper
 

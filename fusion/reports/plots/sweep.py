@@ -72,13 +72,10 @@ def draw(sheet: Sheet, columns: Columns) -> list[Group]:
 
 
 def plot_maps(sheet: Sheet, key: str, columns: Columns, plane: tuple[str, str]) -> list[str]:
-    """Slip, energy per metre and the share of mobile runs over two axes, with the limit of mobility.
+    """Slip, energy per metre, share of mobile runs over two axes, with the limit of mobility; their keys.
 
     Slip and energy are medians over cells in which every run is mobile: medians of survivors would look
     better the worse the conditions are.
-
-    Returns:
-        The keys of the figures.
     """
     from bokeh.palettes import Cividis256, Magma256, Viridis256
 
