@@ -26,7 +26,8 @@ AID_SEED = 1
 NOT_LABELLED = "not labelled"
 CUT = "windows"
 """Last word of the name of a recording that is cut into windows of seconds."""
-OUTAGES_S = (30.0, 60.0, 120.0)
+OUTAGES_S, STARTS = (30.0, 60.0, 120.0), 1
+"""Lengths of the outages, and how many of each in a log, at most."""
 MIN_LEAD_M = 5.0
 """Wheel path before an outage: fixes do not show the heading of a robot at rest."""
 MIN_OUTAGE_M = 3.0
@@ -54,20 +55,19 @@ class Refusal:
 
 @dataclass(frozen=True)
 class FieldLog:
-    """A field log and the largest number of outages of each length."""
+    """A field log, by its name in the catalogue."""
 
     name: str
-    starts: int
 
     @property
     def key(self) -> str:
         """Name of its file."""
-        return f"{FIELD}-{self.starts}-{self.name.replace('/', '_').replace('#', '_')}"
+        return f"{FIELD}-{self.name.replace('/', '_').replace('#', '_')}"
 
 
-def present_logs(starts: int) -> list[FieldLog]:
+def present_logs() -> list[FieldLog]:
     """Logs of the catalogue whose files are present; an outage fits into none of those cut into windows."""
-    return [FieldLog(name, starts) for name in present_recordings() if not name.endswith(f"/{CUT}")]
+    return [FieldLog(name) for name in present_recordings() if not name.endswith(f"/{CUT}")]
 
 
 def runs_of(log: FieldLog) -> list[BenchmarkRun | Refusal]:
@@ -109,7 +109,7 @@ def _outage_runs(log: FieldLog, name: str, recording: Recording) -> Iterator[Ben
         return
     if reference == "truth" and recording.gnss is None:
         recording = aided_by_truth(recording, AID_SEED)
-    outages = outages_of(recording, log.starts)
+    outages = outages_of(recording, STARTS)
     if not outages:
         yield whole
     for outage in outages:

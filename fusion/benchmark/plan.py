@@ -12,8 +12,6 @@ SEEDS = 20
 MOST_SEEDS = 10_000
 QUICK_SEEDS = {"mixed": 2}
 """With --quick: seeds of a family, else 1; only "mixed" runs on all plants."""
-STARTS = 1
-"""Outages of each length in a field log, at most."""
 QUICK_LOGS = ("norlab_drive/grass_2024_8_8_16h11s19/raw",)
 METHOD_NAMES = tuple(method.name for method in METHODS)
 
@@ -77,7 +75,7 @@ class BenchmarkPlan:
     def _field_jobs(self) -> Iterator[Job]:
         if FIELD not in self.families:
             return
-        for log in present_logs(STARTS):
+        for log in present_logs():
             if not self.quick or log.name in QUICK_LOGS:
                 for method in METHOD_NAMES:  # logs are long: one method a job
                     yield Job(log, (method,))

@@ -19,7 +19,6 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Estimate
 
-Lever = tuple[float, ...] | AntennaPlaces
 MIN_STEP_M = 0.1
 """Shorter displacements of a reference do not count as distance: they may be its noise at rest."""
 
@@ -81,9 +80,7 @@ class Errors:
         return travelled_m(self.reference_m, self.min_step_m)
 
 
-def errors_against_truth(
-    estimate: Estimate, recording: Recording, antenna_m: Lever = (0.0, 0.0, 0.0)
-) -> Errors | None:
+def errors_against_truth(estimate: Estimate, recording: Recording, antenna: AntennaPlaces) -> Errors | None:
     """The error series against the truth, or None if nothing can be compared.
 
     The denser of the two is interpolated at the times of the sparser, except inside gaps. Only channels
@@ -100,8 +97,8 @@ def errors_against_truth(
     t_ns = _common_times(estimate.trajectory.t_ns, truth.t_ns)
     if not len(t_ns) or not (has_position or has_yaw or has_velocity):
         return None
-    lever = antenna_m if recording.truth_frame == "antenna" else (0.0, 0.0, 0.0)
-    position, velocity, covariance, yaw, yaw_sigma, R = _point_at(estimate, t_ns, lever)
+    point = antenna if recording.truth_frame == "antenna" else AntennaPlaces.fixed((0.0, 0.0, 0.0))
+    position, velocity, covariance, yaw, yaw_sigma, R = _point_at(estimate, t_ns, point)
     nothing = np.full(len(t_ns), np.nan)
     reference = truth.positions_at(t_ns)[:, :2] if has_position else np.full((len(t_ns), 2), np.nan)
     moved = np.full((len(t_ns), 2), np.nan)
@@ -120,9 +117,7 @@ def errors_against_truth(
     )
 
 
-def errors_against_fixes(
-    estimate: Estimate, held_out: Gnss | None, antenna_m: Lever = (0.0, 0.0, 0.0)
-) -> Errors | None:
+def errors_against_fixes(estimate: Estimate, held_out: Gnss | None, antenna: AntennaPlaces) -> Errors | None:
     """The error series of the antenna against GNSS fixes, or None if no fix lies within the estimate.
 
     A late fix is compared with the estimate at the time when it was measured, as far as the estimator has
@@ -130,8 +125,7 @@ def errors_against_fixes(
     """
     if held_out is None or len(estimate.trajectory) < 2:
         return None
-    places = antenna_m if isinstance(antenna_m, AntennaPlaces) else AntennaPlaces.fixed(antenna_m)
-    measured_ns = np.maximum.accumulate(places.measured_ns(held_out.t_ns))
+    measured_ns = np.maximum.accumulate(antenna.measured_ns(held_out.t_ns))
     held_out = dataclasses.replace(held_out, t_ns=measured_ns)
     valid = np.isfinite(held_out.enu_m[:, :2]).all(axis=1) & (held_out.fix != Fix.NONE)
     grid = estimate.trajectory.t_ns
@@ -139,7 +133,7 @@ def errors_against_fixes(
     fixes = held_out.select(valid & inside & _bracketed(held_out.t_ns, grid))
     if not len(fixes):
         return None
-    position, velocity, covariance, yaw, yaw_sigma, _ = _point_at(estimate, fixes.t_ns, antenna_m)
+    position, velocity, covariance, yaw, yaw_sigma, _ = _point_at(estimate, fixes.t_ns, antenna)
     variance = fixes.sigma_enu_m[:, :2] ** 2
     moved = np.full((len(fixes), 2), np.nan)
     if fixes.velocity_enu_mps is not None:
@@ -207,7 +201,7 @@ def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
 
 
 def _point_at(
-    estimate: Estimate, t_ns: TimesNs, lever_m: Lever
+    estimate: Estimate, t_ns: TimesNs, point: AntennaPlaces
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Position (M, 2), world velocity (M, 3) and position covariance (M, 2, 2) of a body-fixed point;
     yaw and its sigma (M,) and rotation to the world (M, 3, 3) of the body."""
@@ -218,8 +212,7 @@ def _point_at(
     covariance = np.full((len(t_ns), 2, 2), np.nan)
     yaw_sigma = np.full(len(t_ns), np.nan)
     R = quaternion_to_matrix(quaternion)
-    places = lever_m if isinstance(lever_m, AntennaPlaces) else AntennaPlaces.fixed(lever_m)
-    lever = places.at(t_ns)
+    lever = point.at(t_ns)
     arm = np.zeros((len(t_ns), 3))
     if lever.any():
         arm = np.einsum("nij,nj->ni", R, lever)

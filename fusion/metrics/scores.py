@@ -179,8 +179,9 @@ def score(
             start of the reference.
     """
     known, notes = known_keyframes(estimate)
-    truth = errors_against_truth(known, recording, antenna_m)
-    fixes = errors_against_fixes(known, held_out, antenna_m)
+    antenna = antenna_m if isinstance(antenna_m, AntennaPlaces) else AntennaPlaces.fixed(antenna_m)
+    truth = errors_against_truth(known, recording, antenna)
+    fixes = errors_against_fixes(known, held_out, antenna)
     if aligned:
         truth, fixes, aligned_by = align_both(truth, fixes)
         notes += aligned_by

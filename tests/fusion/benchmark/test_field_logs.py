@@ -71,7 +71,7 @@ def test_a_log_is_read_once_for_methods_that_follow_each_other(
     field_logs.opened.cache_clear()
     monkeypatch.setattr(field_logs, "open_recordings", read_again)
     for log in ("one", "one", "two"):
-        (refusal,) = runs_of(FieldLog(log, 1))
+        (refusal,) = runs_of(FieldLog(log))
         assert isinstance(refusal, field_logs.Refusal)
         assert refusal.log == log
         assert "no wheels" in refusal.why
@@ -81,4 +81,4 @@ def test_a_log_is_read_once_for_methods_that_follow_each_other(
 
 def test_logs_cut_into_windows_are_no_runs_of_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(field_logs, "present_recordings", lambda: ["a/raw", "a/windows", "b/windows", "c/s1"])
-    assert [log.name for log in field_logs.present_logs(1)] == ["a/raw", "c/s1"]
+    assert [log.name for log in field_logs.present_logs()] == ["a/raw", "c/s1"]

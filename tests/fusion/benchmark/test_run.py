@@ -95,7 +95,7 @@ def test_logs_are_run_again_once_their_files_differ_or_where_they_were_refused(t
         begun.append(one)
         return one, BenchmarkResult(*given[-1])
 
-    monkeypatch.setattr(BenchmarkPlan, "jobs", lambda self: [Job(FieldLog(str(log), 1), ("fixed",))])
+    monkeypatch.setattr(BenchmarkPlan, "jobs", lambda self: [Job(FieldLog(str(log)), ("fixed",))])
     monkeypatch.setattr(run, "run_job", job)
     row = RunScore("field", "firm", "log", "log", "fixed", error_m=1.0)
     for rows, refused, runs in (
@@ -123,7 +123,7 @@ def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> N
     field_logs.opened.cache_clear()
     monkeypatch.setattr(field_logs, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)])
     monkeypatch.setattr(*place, fail)
-    _, found = run.run_job(Job(FieldLog("one", 1), ("fixed",)))
+    _, found = run.run_job(Job(FieldLog("one"), ("fixed",)))
     assert found == BenchmarkResult((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
     field_logs.opened.cache_clear()
 
@@ -234,7 +234,7 @@ def test_families_by_name_with_seeds_of_their_own() -> None:
 
 
 def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(plan, "present_logs", lambda starts: [])
+    monkeypatch.setattr(plan, "present_logs", list)
     with pytest.raises(TerrafusionError, match="no field log is present"):
         run_benchmark(BenchmarkPlan({"field": None}), tmp_path)
 
