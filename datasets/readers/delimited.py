@@ -265,15 +265,15 @@ def _end(data: bytes, layout: TextLayout) -> str:
     """At which line and time complete lines end, for a note."""
     text = data[-limits.LINE_BYTES :].rstrip().rpartition(b"\n")[2].decode("utf-8", "replace")
     at = f"; its data end in line {data.count(NEWLINE)}"
-    time_s, origin_s = layout.seconds(split(text, layout.separator)), _origin_s(data, layout)
-    return at if time_s is None or origin_s is None else f"{at}, t = {time_s - origin_s:.3f} s"
+    since_s = _since_s(data, layout, split(text, layout.separator))
+    return at if since_s is None else f"{at}, t = {since_s:.3f} s"
 
 
-def _origin_s(data: bytes, layout: TextLayout) -> float | None:
-    """The time from which times count; None where it cannot be read."""
-    if layout.strict:
-        return 0.0
-    return layout.seconds(next(_rows(data, layout), (0, []))[1] if layout.time else [])
+def _since_s(data: bytes, layout: TextLayout, cells: Sequence[str]) -> float | None:
+    """Seconds of a row since 0, or since the first row; None where a time cannot be read."""
+    first = next(_rows(data, layout), (0, []))[1] if layout.time and not layout.strict else []
+    time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
+    return None if time_s is None or origin_s is None else time_s - origin_s
 
 
 def _check_counts(data: bytes, layout: TextLayout) -> None:
@@ -293,9 +293,7 @@ def _check_counts(data: bytes, layout: TextLayout) -> None:
 
 def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
-    time_s, origin_s = layout.seconds(cells), _origin_s(data, layout)
-    since_s = None if time_s is None or origin_s is None else time_s - origin_s
-    return DataError(what, time_s=since_s, remedy=remedy)
+    return DataError(what, time_s=_since_s(data, layout, cells), remedy=remedy)
 
 
 def _counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
