@@ -76,13 +76,13 @@ def once(of: Callable[[CheckContext], T]) -> Callable[[CheckContext], T]:
     """Caches a function's result in the context; callers must not modify it."""
 
     @functools.wraps(of)
-    def kept(context: CheckContext) -> T:
+    def cached(context: CheckContext) -> T:
         if of not in context.computed:
             context.computed[of] = of(context)
         found: T = context.computed[of]
         return found
 
-    return kept
+    return cached
 
 
 def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:

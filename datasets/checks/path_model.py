@@ -207,8 +207,8 @@ def _rest(windows: _Windows, delay_s: float) -> float:
     """Sum of the residuals' sizes at a delay, after the best scale and lever arm of each window."""
     total = 0.0
     for common, residual in windows.steps(np.array([0.0, delay_s, 0.0, 0.0, 0.0])):
-        kept = common[:, [0, 2, 3, 4]]
-        fitted = kept @ np.linalg.lstsq(kept, residual, rcond=1e-6)[0]
+        columns = common[:, [0, 2, 3, 4]]
+        fitted = columns @ np.linalg.lstsq(columns, residual, rcond=1e-6)[0]
         total += float(np.abs(residual - fitted).sum())
     return total
 

@@ -264,13 +264,13 @@ def _refuse(log: str, findings: list[Finding]) -> None:
 
 def command_line() -> str:
     """The command as it was typed, without where its results go and what it prints."""
-    words, kept = iter(sys.argv[1:]), ["terrafusion"]
+    words, remaining = iter(sys.argv[1:]), ["terrafusion"]
     for word in words:
         if word == "--out":
             next(words, None)
         elif word not in SHARED and not word.startswith("--out="):
-            kept.append(word)
-    return shlex.join(kept)
+            remaining.append(word)
+    return shlex.join(remaining)
 
 
 def read_json(path: Path) -> Any:
@@ -312,14 +312,14 @@ def _progress_lines(what: str) -> Callable[[float], None]:
     begun = time.monotonic()
     last = [begun]
 
-    def tell(share: float) -> None:
+    def report(share: float) -> None:
         now = time.monotonic()
         if share > 0.0 and now - last[0] >= LINE_EVERY_S:
             last[0] = now
             left_s = (now - begun) * (1.0 - share) / share
             print(f"{what}: {share:.0%}, {left_s:.0f} s left", file=sys.stderr, flush=True)
 
-    return tell
+    return report
 
 
 def check_backend(backend: str, address: str | None) -> None:

@@ -180,7 +180,7 @@ def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
     paths = {kind: _trajectory(rows[kind]) for kind in ("center", "front") if kind in rows}
     if not paths:
         return None, []
-    notes = [note for kind, (_, said) in paths.items() for note in (f"{kind}: {text}" for text in said)]
+    notes = [f"{kind}: {text}" for kind, (_, texts) in paths.items() for text in texts]
     if len(paths) == 2:
         return paths["center"][0], [*notes, _front_note(paths["center"][0], paths["front"][0])]
     (kind, (truth, _)) = next(iter(paths.items()))
