@@ -122,8 +122,7 @@ def check_direction(context: CheckContext) -> Iterator[Finding]:
 
 
 def _reversal(context: CheckContext) -> tuple[str, Repair]:
-    """What to do with wheels that run backwards; where they turn as the gyro does, their sides are swapped,
-    too."""
+    """What to do with wheels that run backwards; that they turn as the gyro does means swapped sides, too."""
     wheels, signs = context.recording.wheels, partial(_change_signs, sides=("left", "right"))
     if wheels is None or not wheels.has_sides() or turning_axis(context) != "+z":
         return "change the sign of all wheels", signs

@@ -125,12 +125,9 @@ def _check(recordings: tuple[Recording, ...], source: str, window_s: float) -> N
 def _search(
     problem: Problem, progress: Callable[[float], None] | None
 ) -> tuple[Solution, Array, Identifiability]:
-    """Solution, covariance (G, G) and identifiability.
+    """Solution, covariance (G, G) and identifiability; a TerrafusionError where the twin diverges at once.
 
     Parameters that are not identified return to their priors, and the others are solved again.
-
-    Raises:
-        TerrafusionError: the twin diverges at the start values.
     """
     solution = solve(problem, progress=progress)
     if solution.normal is None:

@@ -233,8 +233,7 @@ def _one_sensor(
 ) -> BagTopic:
     """The topic of a sensor among several of one type: the one with data, else that in the robot's frame.
 
-    Raises:
-        DataError: both are there; names them and the option to choose.
+    A DataError where both are there names them and the option to choose.
     """
     keys = {topic.name: (topic.name, topic.msgtype) for topic in candidates}
     streams = read_streams(container, {key: wanted_fields(kind, key[1]) for key in keys.values()})
