@@ -121,7 +121,7 @@ def evaluate(
 
     loaded, count = load_terrain_model(model), seeds or 1
     with progress("runs", count * len(TrainingPlan().grid(0).conditions())) as tick:
-        scores = scores_of(loaded, fresh_routes(count, tick))
+        scores = scores_of([(loaded, route) for route in fresh_routes(count, tick)])
     return Result(score_lines("new runs", scores), "", dataclasses.asdict(scores))
 
 

@@ -91,12 +91,7 @@ def changes_in(windows: list[Window], labels: NDArray[Any]) -> LabelledRoute:
     return LabelledRoute(windows, labels, [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist()])
 
 
-def evaluate(model: TerrainModel, routes: Sequence[LabelledRoute]) -> DetectorScores:
-    """Run a new detector along each route and score it."""
-    return evaluate_each([(model, route) for route in routes])
-
-
-def evaluate_each(trials: Sequence[tuple[TerrainModel, LabelledRoute]]) -> DetectorScores:
+def evaluate(trials: Sequence[tuple[TerrainModel, LabelledRoute]]) -> DetectorScores:
     """Run a new detector along each route, by the model beside it, and score them all.
 
     The models have the same classes.

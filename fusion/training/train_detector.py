@@ -103,7 +103,7 @@ def train(
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
     )
     model = calibrate(fitted, splice(calibration, PATCHES, CALIBRATION_SEED))
-    scores = evaluate(model, [splice(scoring, PATCHES, SCORING_SEED)])
+    scores = evaluate([(model, splice(scoring, PATCHES, SCORING_SEED))])
     if store is not None:
         store.clear()
     return dataclasses.replace(model, scores=_plain(scores)), scores
@@ -129,15 +129,12 @@ def draft(rows: dict[str, Array], vehicle: str) -> TerrainModel:
     return TerrainModel(mixtures, _broad(mixtures), 1.0, PATCH_LENGTH_M, (vehicle,))
 
 
-def windows_by_run(grid: Grid, tick: Callable[[], None]) -> list[LabelledWindows]:
-    """The windows and ground of every run of a grid."""
-    return run_windows(grid.conditions(), Workers(None), None, tick)
-
-
 def fresh_routes(seeds: int, tick: Callable[[], None] = lambda: None) -> list[LabelledRoute]:
     """Routes spliced from simulated runs of new seeds."""
-    grids = {seed: TrainingPlan().grid(seed) for seed in range(FRESH_SEED, FRESH_SEED + seeds)}
-    return [splice(windows_by_run(grid, tick), PATCHES, seed) for seed, grid in grids.items()]
+    return [
+        splice(run_windows(TrainingPlan().grid(seed).conditions(), Workers(None), None, tick), PATCHES, seed)
+        for seed in range(FRESH_SEED, FRESH_SEED + seeds)
+    ]
 
 
 def run_windows(

@@ -16,7 +16,7 @@ from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.terrain.spectrum import band_levels
-from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate_each, splice
+from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.logged_runs import LoggedRun
 from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectrum
 from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
@@ -93,7 +93,7 @@ def cross_validated(runs: Sequence[LoggedRun]) -> tuple[DetectorScores, Detector
         stretches = [piece for run in held_out for piece in pieces(run)]
         if len({ground for _, ground in stretches}) > 1:
             spliced.append((model, splice(stretches, PATCHES, fold)))
-    return evaluate_each(tried), evaluate_each(spliced) if spliced else None
+    return evaluate(tried), evaluate(spliced) if spliced else None
 
 
 def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:
@@ -109,7 +109,7 @@ def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:
             channel="terrain",
             remedy=f"give runs on {', '.join(model.classes)}",
         )
-    return evaluate_each([(model, run.route) for run in runs])
+    return evaluate([(model, run.route) for run in runs])
 
 
 def check_runs(runs: Sequence[LoggedRun]) -> None:

@@ -17,7 +17,8 @@ from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.training.detector_scores import LabelledRoute, changes_in, evaluate, splice
 from terrafusion.fusion.training.simulated_runs import Condition, Grid, windows_of
-from terrafusion.fusion.training.train_detector import TrainingPlan, calibrate, train, windows_by_run
+from terrafusion.fusion.training.train_detector import TrainingPlan, calibrate, run_windows, train
+from terrafusion.twin.executors import Workers
 from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()
@@ -28,7 +29,7 @@ MODEL = load_terrain_model()
 def route() -> LabelledRoute:
     """Patches of eight drives with a seed that neither training, calibration nor scoring use."""
     grid = Grid(("figure_eight",), (0.0, 3.0), (15.0,), (77,))
-    return splice(list(windows_by_run(grid, lambda: None)), patches=30, seed=77)
+    return splice(run_windows(grid.conditions(), Workers(None), None, lambda: None), patches=30, seed=77)
 
 
 def window(seed: int = 0, **changes: float | None) -> Window:
@@ -42,7 +43,7 @@ def window(seed: int = 0, **changes: float | None) -> Window:
 
 
 def test_grounds_are_told_apart_and_changes_seen_within_two_seconds(route: LabelledRoute) -> None:
-    scores = evaluate(MODEL, [route])
+    scores = evaluate([(MODEL, route)])
     assert scores.macro_f1 > 0.95
     assert scores.ece < 0.05
     assert scores.unknown_share < 0.05
@@ -54,20 +55,22 @@ def test_grounds_are_told_apart_and_changes_seen_within_two_seconds(route: Label
 
 def test_grounds_are_told_apart_without_slip(route: LabelledRoute) -> None:
     windows = [dataclasses.replace(w, slip=None, slip_sigma=None) for w in route.windows]
-    assert evaluate(MODEL, [dataclasses.replace(route, windows=windows)]).macro_f1 > 0.9
+    assert evaluate([(MODEL, dataclasses.replace(route, windows=windows))]).macro_f1 > 0.9
 
 
 def test_a_ground_left_out_of_the_model_becomes_unknown(route: LabelledRoute) -> None:
     fewer = {name: mixture for name, mixture in MODEL.classes.items() if name != "asphalt"}
     labels = np.where(route.labels == "asphalt", "unknown", route.labels)
-    scores = evaluate(dataclasses.replace(MODEL, classes=fewer), [dataclasses.replace(route, labels=labels)])
+    scores = evaluate(
+        [(dataclasses.replace(MODEL, classes=fewer), dataclasses.replace(route, labels=labels))]
+    )
     assert scores.confusion[-1][-1] > 0.8
 
 
 def test_the_twins_own_route_over_five_grounds() -> None:
     recording = simulate("mixed_terrain", seed=77)
     stream = Condition("mixed_terrain", "mixed", 0.0, 0.0, 77).stream("estimator")
-    scores = evaluate(MODEL, [changes_in(*windows_of(recording, stream))])
+    scores = evaluate([(MODEL, changes_in(*windows_of(recording, stream)))])
     assert scores.macro_f1 > 0.9
     assert scores.switch_delay_s[2] <= 3.0
 
@@ -88,7 +91,7 @@ def test_calibration_cools_a_model_that_is_too_sure(route: LabelledRoute) -> Non
     sure = {name: dataclasses.replace(m, covariance=0.3 * m.covariance) for name, m in MODEL.classes.items()}
     calibrated = calibrate(dataclasses.replace(MODEL, classes=sure), route)
     assert calibrated.temperature > MODEL.temperature
-    assert evaluate(calibrated, [route]).unknown_share < 0.1
+    assert evaluate([(calibrated, route)]).unknown_share < 0.1
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(-2.0, 3.0), st.floats(0.0, 2.0)), max_size=6))
