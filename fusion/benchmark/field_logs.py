@@ -15,7 +15,7 @@ from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.benchmark.methods import known_labels, true_labels
-from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
+from terrafusion.fusion.benchmark.outage_plan import LEAD_S, LEAD_SHARE, aided_by_truth, plan_outages, until
 from terrafusion.fusion.benchmark.twin_runs import FIELD, BenchmarkRun
 from terrafusion.fusion.metrics.health import rolled_until_m
 from terrafusion.fusion.metrics.scores import Outage
@@ -187,6 +187,6 @@ def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
     if rolled[-1] < MIN_LEAD_M:
         return []
     moved_s = (int(wheels.t_ns[np.searchsorted(rolled, MIN_LEAD_M)]) - start_ns) * 1e-9
-    earliest = max(first_s + lead_s(first_s, last_s), moved_s)
+    earliest = max(first_s + min(LEAD_S, LEAD_SHARE * (last_s - first_s)), moved_s)
     planned = [o for s in OUTAGES_S for o in plan_outages(earliest, last_s, s, most_starts)]
     return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= MIN_OUTAGE_M]

@@ -21,11 +21,6 @@ AID_HZ, AID_SIGMA_M, AID_SIGMA_UP_M = 2.0, 0.1, 0.2
 """Simulated fixes: rate and white noise; assumed, between RTK and differential GNSS."""
 
 
-def lead_s(first_s: float, last_s: float) -> float:
-    """Least time of aiding before the first outage of a run between two times."""
-    return min(LEAD_S, LEAD_SHARE * (last_s - first_s))
-
-
 def plan_outages(earliest: float, last_s: float, seconds: float, most: int) -> tuple[Outage, ...]:
     """Outages of one length that start at `earliest` or later and end before `last_s`, evenly spread.
 

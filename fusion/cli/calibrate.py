@@ -106,7 +106,8 @@ def calibrate(
             truth=truth, robust=robust, channels=split(channels) or None, window_s=window_s,
             slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
         )  # fmt: skip
-    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": common.command_line()})
+    given = dict.fromkeys(found.model.soils, soils) if isinstance(soils, str) else soils
+    write_calibration(out, found, vehicle, given, {"command": common.command_line()})
     return _shown(found, vehicle, out, suggest)
 
 
@@ -159,11 +160,6 @@ def parse_terrain(entries: list[str] | None) -> str | dict[str, str] | None:
             raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
         return entries[0] if entries else None
     return common.parse_pairs(entries, "LABEL=SOIL; one soil for all logs stands alone", "--terrain")
-
-
-def named_soils(soils: str | dict[str, str] | None, found: Calibration) -> dict[str, str]:
-    """The files or names that the soils of the calibration came from."""
-    return dict.fromkeys(found.model.soils, soils) if isinstance(soils, str) else dict(soils or {})
 
 
 def parse_prior(text: str) -> tuple[str, Prior]:
