@@ -37,6 +37,11 @@ Reason = tuple[str, str]
 """A value and a sentence."""
 
 
+def doubtful(sentence: str) -> Reason:
+    """A reason to doubt a run."""
+    return DOUBTFUL, sentence
+
+
 def gnss_innovations(run: Run) -> list[Innovation]:
     """The innovations of fixes."""
     return [i for i in run.estimate.innovations if i.sensor == "gnss"]

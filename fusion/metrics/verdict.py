@@ -26,6 +26,7 @@ from terrafusion.fusion.metrics.judged_run import (
     UNUSABLE,
     Reason,
     Run,
+    doubtful,
     gnss_innovations,
     since_s,
 )
@@ -143,10 +144,9 @@ def _outages(run: Run) -> Iterator[Reason]:
         end = outage.end_error_m
         if end is not None and end > FAR_M:
             share = f", {outage.percent:.0f} % of the distance" if outage.percent is not None else ""
-            yield (
-                DOUBTFUL,
+            yield doubtful(
                 f"{outage.seconds:g} s without GNSS from {outage.start_s:g} s on end {end:.1f} m off{share}; "
-                "expect as much wherever fixes are missing for so long",
+                "expect as much wherever fixes are missing for so long"
             )
 
 
@@ -175,10 +175,9 @@ def _five_sigma(run: Run) -> Iterator[Reason]:
 def _nees(run: Run) -> Iterator[Reason]:
     row = _row(run, "position")
     if row is not None and row.mean > SIGMA_RATIO**2 * row.high:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"position errors are {row.mean**0.5:.1f} times their sigma (NEES {row.mean:.1f} per dimension, "
-            f"at most {row.high:.1f} expected): do not rely on sigma",
+            f"at most {row.high:.1f} expected): do not rely on sigma"
         )
 
 
@@ -193,10 +192,9 @@ def _worse_than_a_baseline(run: Run) -> Iterator[Reason]:
         promised = row is None or row.mean <= row.high
         ratio, more_m = (FAR_WORSE, FAR_WORSE_M) if promised else (CLEARLY_WORSE, CLEARLY_M)
         if ours > ratio * theirs and ours - theirs > more_m:
-            yield (
-                DOUBTFUL,
+            yield doubtful(
                 f"{name} has an error of {theirs:.2f} m, the estimate {ours:.2f} m: a sensor or a number of "
-                "the vehicle file misleads it; see `terrafusion inspect`",
+                "the vehicle file misleads it; see `terrafusion inspect`"
             )
     yield from _worse_in_outages(run)
 
@@ -216,11 +214,10 @@ def _worse_in_outages(run: Run) -> Iterator[Reason]:
     lost = int((ours > theirs).sum())
     chance = float(binom.sf(lost - 1, len(ends), 0.5))
     if chance < 1.0 - CONFIDENCE and np.median(ours) > CLEARLY_WORSE * np.median(theirs):
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"plain dead reckoning is nearer at the end of {lost} of {len(ends)} outages, "
             f"{np.median(theirs):.2f} m for {np.median(ours):.2f} m: "
-            "wheels or gyro are weighted wrongly; see `terrafusion calibrate`",
+            "wheels or gyro are weighted wrongly; see `terrafusion calibrate`"
         )
 
 
@@ -233,16 +230,14 @@ def _certain(run: Run) -> Iterator[Reason]:
     k = int(np.nanargmax(sigma)) if np.isfinite(sigma).any() else 0
     limit_m = max(SIGMA_KNOWN_M, 3.0 * _fix_sigma_m(run.used))
     if sigma[k] > limit_m:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"the position is known to {sigma[k]:.0f} m only (1 sigma) at "
-            f"{since_s(run, int(path.t_ns[k])):.0f} s: without fixes the uncertainty grows",
+            f"{since_s(run, int(path.t_ns[k])):.0f} s: without fixes the uncertainty grows"
         )
     yaw_sigma = float(np.sqrt(path.covariance[-1, 5, 5]))
     if yaw_sigma > YAW_SIGMA_KNOWN_RAD:
-        yield (
-            DOUBTFUL,
-            f"the heading is unknown at the end: {np.degrees(yaw_sigma):.0f} deg (1 sigma); drive on",
+        yield doubtful(
+            f"the heading is unknown at the end: {np.degrees(yaw_sigma):.0f} deg (1 sigma); drive on"
         )
 
 
@@ -254,11 +249,10 @@ def _innovations(run: Run) -> Iterator[Reason]:
     expected = 1.0 - CONFIDENCE
     spread = np.sqrt(expected * CONFIDENCE / max(row.effective, 1.0))
     if share > 2.0 * expected and share > expected + SIGNIFICANT_Z * spread and row.mean > row.high:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"GNSS innovations are {row.mean**0.5:.1f} times what their sigmas allow, {100.0 * share:.0f} % "
             "of them beyond the 95 % bound: sigmas too small, a late receiver, or wrong wheels or IMU; "
-            "try `terrafusion inspect`",
+            "try `terrafusion inspect`"
         )
 
 
@@ -284,11 +278,10 @@ def _rejections(run: Run) -> Iterator[Reason]:
     if end - first >= IN_A_ROW:
         size = float(np.median([np.hypot(*i.value[:2]) for i in fixes[first:end]]))
         at = since_s(run, fixes[first].t_ns)
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"{end - first} fixes in a row from {at:.0f} s on lie {size:.1f} m off the estimate"
             + (", which then moved to them" if fixes[end - 1].accepted else "")
-            + ": either they or the estimate are wrong there",
+            + ": either they or the estimate are wrong there"
         )
 
 
@@ -298,10 +291,9 @@ def _path_ratio(run: Run) -> Iterator[Reason]:
         return
     scale, _ = min(found, key=lambda both: both[0].high - both[0].low)
     if scale.high < SMALL:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"the robot moved {scale.ratio:.2f} of the path of its wheels by the {scale.source}, on ground "
-            "that is not known to be soft: check wheel radius and unit, unless it slipped",
+            "that is not known to be soft: check wheel radius and unit, unless it slipped"
         )
 
 
@@ -310,9 +302,8 @@ def _unchecked(run: Run) -> Iterator[Reason]:
         return
     missing = _disagreement(run)
     if missing:
-        yield (
-            DOUBTFUL,
-            f"nothing to check the path against: no GNSS, no truth, and {missing}; record one of them",
+        yield doubtful(
+            f"nothing to check the path against: no GNSS, no truth, and {missing}; record one of them"
         )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.metrics.judged_run import DOUBTFUL, FIVE_SIGMA, STRAY_SHARE, Reason, Run, since_s
+from terrafusion.fusion.metrics.judged_run import FIVE_SIGMA, STRAY_SHARE, Reason, Run, doubtful, since_s
 
 REPORTED = (
     "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
@@ -27,7 +27,7 @@ def misplaced_truth(run: Run) -> Iterator[Reason]:
     """A truth in another frame than the fixes: no error against it says anything of the estimate."""
     for finding in run.findings if run.scores.against == "truth" else ():
         if finding.code == "truth-frame":
-            yield DOUBTFUL, f"errors are not judged: {finding.what} ({finding.evidence}); {finding.fix}"
+            yield doubtful(f"errors are not judged: {finding.what} ({finding.evidence}); {finding.fix}")
 
 
 def log_checks(run: Run) -> Iterator[Reason]:
@@ -37,9 +37,8 @@ def log_checks(run: Run) -> Iterator[Reason]:
             continue
         clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
         if finding.severity == "error" or finding.code in REPORTED or clock:
-            yield (
-                DOUBTFUL,
-                f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}",
+            yield doubtful(
+                f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
             )
 
 
@@ -52,11 +51,10 @@ def delayed(run: Run) -> Iterator[Reason]:
     shift_m = abs(delay_s) * speed_mps
     beyond = shift_m**2 > FIVE_SIGMA * variance_m2
     if abs(delay_s) > DELAY_SIGMAS * sigma_s and beyond.mean() > STRAY_SHARE:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"the fixes seem {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} (1 sigma "
             f"{sigma_s:.2f} s), up to {shift_m[beyond].max():.2f} m of the path, and are not corrected; "
-            "give the receiver's delay in the vehicle file, or drive longer",
+            "give the receiver's delay in the vehicle file, or drive longer"
         )
 
 
@@ -82,11 +80,10 @@ def refuted(run: Run) -> Iterator[Reason]:
             names += [name] if beyond.any() else []
     if wrong.mean() > STRAY_SHARE:
         until_s = since_s(run, int(t_ns[wrong][-1]))
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             f"up to {until_s:.0f} s the results rest on numbers that the drive then refuted "
             f"({', '.join(names)}), and sigma does not include that; write what it showed to a vehicle file "
-            "(`terrafusion calibrate LOG --sensors`) and replay the log with it",
+            "(`terrafusion calibrate LOG --sensors`) and replay the log with it"
         )
 
 
@@ -105,11 +102,10 @@ def unconfirmed_imu(run: Run) -> Iterator[Reason]:
     off_m = np.linalg.norm(velocity_mps[later] - velocity_mps[1:], axis=1) / np.sqrt(2.0)
     beyond = off_m**2 > FIVE_SIGMA * variance_m2
     if beyond.mean() > STRAY_SHARE:
-        yield (
-            DOUBTFUL,
+        yield doubtful(
             "neither vehicle file nor drive show how the IMU is turned about its vertical axis: a quarter "
             f"turn would move results by up to {off_m[beyond].max():.1f} m, beyond their sigma; give "
-            "`imu_yaw_rad` in the vehicle file, or drive longer, with changes of speed and turns",
+            "`imu_yaw_rad` in the vehicle file, or drive longer, with changes of speed and turns"
         )
 
 
