@@ -33,6 +33,8 @@ HDF5_VALUES, HDF5_REFERENCES = 2_000_000, 10_000
 """Values of a variable, and of a stored piece of one: two hours at 250 Hz."""
 PICKLE_BYTES = 32 * 2**20
 """Two hours of a published log have as many."""
+LARGEST = 1e30
+"""No number of a log is larger; squares of these are still numbers."""
 
 
 def too_much(what: str, most: float, remedy: str = "split it") -> DataError:

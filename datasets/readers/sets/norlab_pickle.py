@@ -280,9 +280,6 @@ def _labels(start_ns: int, terrain: str) -> Terrain | None:
     return Terrain(np.array([start_ns], dtype=np.int64), np.array([terrain], dtype=object))
 
 
-LARGEST = 1e30
-"""No number of a log is larger; squares of these are still numbers."""
-
 ALLOWED = {
     f"{module}.{name}"
     for modules, names in {
@@ -356,7 +353,7 @@ def numbers(column: NDArray[Any]) -> NDArray[np.float64]:
     """A column (N,) of numbers, or of texts that are numbers; an empty text or None is NaN.
 
     Raises:
-        ValueError: a cell is something else, or beyond `LARGEST`.
+        ValueError: a cell is something else, or beyond `limits.LARGEST`.
     """
     if column.dtype == object:
         cells = [np.nan if cell is None or cell == "" else cell for cell in column.tolist()]
@@ -366,6 +363,6 @@ def numbers(column: NDArray[Any]) -> NDArray[np.float64]:
     else:
         values = column.astype(float)
         values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
-    if (np.abs(values) > LARGEST).any():
-        raise ValueError(f"a number beyond {LARGEST:g}")
+    if (np.abs(values) > limits.LARGEST).any():
+        raise ValueError(f"a number beyond {limits.LARGEST:g}")
     return values

@@ -235,8 +235,6 @@ _CLASSES = ((Fix.FIXED, 0.05), (Fix.FLOAT, 0.5), (Fix.DGPS, 1.0), (Fix.SINGLE, n
 """Fix class by the median horizontal sigma below, m; infinite sigmas are single points."""
 
 
-LARGEST = 1e30
-"""No number of a log is larger; squares of these are still numbers."""
 MAGIC = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
@@ -313,8 +311,8 @@ class MatlabFile:
             raise self._wrong(name, f"claims {largest} values, or keeps them in other files")
         values = np.asarray(data[()], dtype=float)
         values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
-        if (np.abs(values) > LARGEST).any():
-            raise self._wrong(name, f"holds numbers beyond {LARGEST:g}")
+        if (np.abs(values) > limits.LARGEST).any():
+            raise self._wrong(name, f"holds numbers beyond {limits.LARGEST:g}")
         return values
 
     def _wrong(self, name: str, what: str) -> DataError:
