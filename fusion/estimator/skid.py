@@ -33,6 +33,9 @@ MEMORY_S = 10.0
 """Time constant of the variance rate while the robot drives and fixes are accepted (assumed: a few turns)."""
 FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
+UNAIDED_S, NO_SKID_S = 5.0, 30.0
+"""Driving without an accepted fix from which the mean rate of the drive holds at least; and the driving without
+a skid that the mean begins with (assumed)."""
 COARSE_M2 = 1.0
 """Variance of a fix, both axes, above which it shows little of a skid: .7 m each (assumed)."""
 LEAST_GAP_S = 0.1
@@ -58,6 +61,7 @@ class SkidDetector:
         self.refutations = 0
         self._before: tuple[float, list[_Passed]] = (0.0, [])
         self._driven_s = 0.0
+        self._aided_s, self._skidded_m2 = NO_SKID_S, 0.0
         self._before_m = np.zeros(2)
         self._last_ns: int | None = None
 
@@ -133,13 +137,16 @@ class SkidDetector:
             chain.revise(i, wheels=wheels, link=link)
 
     def with_extra_variance(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
-        """The increment over `dt_s` with the variance of the skid; unchanged where there is none."""
+        """The increment over `dt_s` with the variance of the skid; unchanged where there is none.
+
+        Without fixes a robot that has skidded now and then will do so again: its mean rate is the least.
+        """
         driven_s = dt_s * driving(before, wheels, dt_s)
         self._driven_s += driven_s
-        if not self.rate_m2ps:
-            return wheels
         self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
-        return wheels.with_extra_variance(self.rate_m2ps * driven_s)
+        usual_m2ps = self._skidded_m2 / self._aided_s if self._driven_s > UNAIDED_S else 0.0
+        rate_m2ps = max(self.rate_m2ps, usual_m2ps)
+        return wheels.with_extra_variance(rate_m2ps * driven_s) if rate_m2ps else wheels
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array, fix_m2: float) -> None:
         """Adapt the rate to a fix that is used: `innovation_m` (2,), the variances (2,) predicted for it, and
@@ -152,6 +159,9 @@ class SkidDetector:
         if before_ns is not None and t_ns <= before_ns:
             return
         self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
+        if driven_s <= UNAIDED_S:
+            self._aided_s += driven_s
+            self._skidded_m2 += self.rate_m2ps * driven_s
         before_m, self._before_m = self._before_m, innovation_m
         telling = fix_m2 <= max(2.0 * self.rate_m2ps * MEMORY_S, COARSE_M2)
         if self.rate_m2ps and driven_s > 0.0 and telling:

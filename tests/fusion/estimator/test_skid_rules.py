@@ -181,6 +181,25 @@ def test_a_skid_fades_with_the_time_that_is_driven() -> None:
     assert wheels.sigma[0] ** 2 == pytest.approx(0.01**2 + rate * SHARE)
 
 
+def test_without_fixes_a_robot_skids_as_much_as_it_usually_did() -> None:
+    """The mean rate of the drive, of which half a minute without a skid is assumed, after 5 s of driving."""
+    slide = SkidDetector()
+    for k in range(1, 31):
+        slide.rate_m2ps = 0.5
+        slide.with_extra_variance(rolled(3.0), moving(3.0), 1.0)
+        slide.accepted(k * S, np.zeros(2), np.zeros(2), 1e9)
+    slide.rate_m2ps, quiet = 0.0, rolled(3.0)
+    for _ in range(5):
+        assert slide.with_extra_variance(quiet, moving(3.0), 1.0) is quiet
+    slide.with_extra_variance(quiet, moving(3.0), 1.0)
+    loose = slide.with_extra_variance(quiet, moving(3.0), 1.0)
+    passed_s = 30.0 * SHARE
+    usual = 0.5 * math.exp(-SHARE / 20.0) * passed_s / (30.0 + passed_s)
+    assert loose.sigma[0] ** 2 == pytest.approx(0.01**2 + usual * SHARE)
+    slide.accepted(99 * S, np.zeros(2), np.zeros(2), 0.04)
+    assert slide.with_extra_variance(quiet, moving(3.0), 1.0) is quiet
+
+
 def test_accepted_fixes_move_the_rate_by_what_their_innovations_tell() -> None:
     """Half of the product with the one before, or of what is more than predicted, whichever is less."""
     slide = SkidDetector()
