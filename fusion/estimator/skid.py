@@ -34,8 +34,8 @@ MEMORY_S = 10.0
 FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
 UNAIDED_S, NO_SKID_S = 5.0, 30.0
-"""Driving without an accepted fix from which the mean rate of the drive holds at least; and the driving without
-a skid that the mean begins with (assumed)."""
+"""Driving without an accepted fix from which the mean rate of the drive holds at least; and the driving
+without a skid that the mean begins with (assumed)."""
 COARSE_M2 = 1.0
 """Variance of a fix, both axes, above which it shows little of a skid: .7 m each (assumed)."""
 LEAST_GAP_S = 0.1
