@@ -11,8 +11,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# The same examples in every run: a change that breaks something is told from bad luck.
-hypothesis.settings.register_profile("fixed", derandomize=True)
+# The same examples in every run, and no time limit: a failure is neither bad luck nor a busy machine.
+hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("fixed")
 
 # The matrices here are small: threads of the linear algebra only wait for each other on a busy machine.
