@@ -98,11 +98,13 @@ def test_a_bag_cut_off_before_its_first_message(husky_bag: Path, tmp_path: Path,
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.parametrize("share", [0.1, 1.0])
-def test_truncated_bag(share: float, husky_bag: Path, tmp_path: Path, terrafusion) -> None:
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.1, "replay cut.bag --vehicle husky --out results"), (1.0, "convert cut.bag log")]
+)
+def test_truncated_bag(share: float, words: str, husky_bag: Path, tmp_path: Path, terrafusion) -> None:
     data = husky_bag.read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: min(int(share * len(data)), len(data) - 10)])
-    outcome = terrafusion("replay", "cut.bag", "--vehicle", "husky", "--out", "results")
+    outcome = terrafusion(*words.split())
     assert outcome.status == 0, outcome
     assert "warning: cut.bag: cut.bag is cut off" in outcome.err
     assert "its data end at t = " in outcome.err
