@@ -1,5 +1,6 @@
 """`simulate`: one drive of the twin, as a `Recording` with truth."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.model.soil import SoilParams
-from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.model.vehicle import VehicleParams, vehicle_names
 from terrafusion.twin.run_recording import record, run_notes
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.scenario import Scenario
@@ -112,4 +113,7 @@ def simulate_run(
     if backend != "c" and (backend == "vm" or not compiled()):
         recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
     recording = recording.with_notes(*run_notes(setup, motion, vehicle))
+    # A vehicle of the user's own is found again by its file, which the writers of logs copy.
+    if not isinstance(vehicle, VehicleParams) and str(vehicle) not in vehicle_names():
+        recording = dataclasses.replace(recording, vehicle=str(vehicle))
     return SimulatedRun(recording, setup.t_s, driven.states, slip, summary, driven.commanded)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from typer.testing import CliRunner
 
 from terrafusion.datasets.readers import open_recording
 from terrafusion.fusion.cli.main import app, main
+from terrafusion.twin.model.choose import choose_vehicle
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -52,6 +54,17 @@ def test_options_reach_the_run_and_the_log_holds_it(tmp_path: Path) -> None:
     log = open_recording(tmp_path / "log")
     assert log.imu is not None
     assert log.imu.accel_mps2[:100, 1].mean() == pytest.approx(-9.8 * 0.07, abs=0.1)
+
+
+@pytest.mark.parametrize("out", ["log", "log.mcap"])
+def test_a_log_finds_the_vehicle_of_the_users_own_file(out: str, tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text(SHORT)
+    own = files("terrafusion.twin.params").joinpath("vehicles", "generic.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(own.replace("name: generic", "name: cart").replace("0.165", "0.172"))
+    done = CliRunner().invoke(app, ["simulate", "short.yaml", "--vehicle", "own.yaml", "--out", out])
+    assert done.exit_code == 0, done.output
+    chosen, _ = choose_vehicle(open_recording(tmp_path / out))
+    assert (chosen.name, chosen.odometry.wheel_radius_m) == ("cart", pytest.approx(0.172))
 
 
 def test_immobilisation_is_told_with_place_and_cause(tmp_path: Path) -> None:
