@@ -61,7 +61,7 @@ class SkidDetector:
         self.refutations = 0
         self._before: tuple[float, list[_Passed]] = (0.0, [])
         self._driven_s = 0.0
-        self._aided_s, self._skidded_m2 = NO_SKID_S, 0.0
+        self._aided_s, self._skidded_m2, self._this_skid_m2 = NO_SKID_S, 0.0, 0.0
         self._before_m = np.zeros(2)
         self._last_ns: int | None = None
 
@@ -126,6 +126,8 @@ class SkidDetector:
     def restart(self) -> None:
         """Forget the skid: it was the heading, or the angle of the IMU, that the fixes refuted."""
         self.rate_m2ps = 0.0
+        self._skidded_m2 -= self._this_skid_m2
+        self._this_skid_m2 = 0.0
         if self.friction is not None:
             self.friction.restart()
 
@@ -162,6 +164,7 @@ class SkidDetector:
         if driven_s <= UNAIDED_S:
             self._aided_s += driven_s
             self._skidded_m2 += self.rate_m2ps * driven_s
+            self._this_skid_m2 += self.rate_m2ps * driven_s
         before_m, self._before_m = self._before_m, innovation_m
         telling = fix_m2 <= max(2.0 * self.rate_m2ps * MEMORY_S, COARSE_M2)
         if self.rate_m2ps and driven_s > 0.0 and telling:
@@ -169,6 +172,8 @@ class SkidDetector:
             beyond = more_m2 / driven_s
             rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond
             self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
+        if not self.rate_m2ps:
+            self._this_skid_m2 = 0.0
 
 
 def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> float:

@@ -200,6 +200,16 @@ def test_without_fixes_a_robot_skids_as_much_as_it_usually_did() -> None:
     assert slide.with_extra_variance(quiet, moving(3.0), 1.0) is quiet
 
 
+def test_a_skid_that_was_a_wrong_heading_is_none_of_the_usual() -> None:
+    slide, quiet = SkidDetector(), rolled(3.0)
+    slide.rate_m2ps = 0.5
+    slide.with_extra_variance(quiet, moving(3.0), 1.0)
+    slide.accepted(S, np.zeros(2), np.zeros(2), 1e9)
+    slide.restart()
+    for _ in range(9):
+        assert slide.with_extra_variance(quiet, moving(3.0), 1.0) is quiet
+
+
 def test_accepted_fixes_move_the_rate_by_what_their_innovations_tell() -> None:
     """Half of the product with the one before, or of what is more than predicted, whichever is less."""
     slide = SkidDetector()
