@@ -94,12 +94,12 @@ class Fleet:
         plants: Sequence[Plant],
         dt_s: float,
         backend: str = "auto",
-        substeps: int | None = None,
+        substeps: Sequence[int] | int | None = None,
         order: int = 4,
         short: bool = False,
     ) -> Self:
         """Groups plants that share graph and step, as many as a driver has lanes; arguments as those of
-        `integrate_many`.
+        `integrate_many`, `substeps` also by plant.
 
         Raises:
             ValueError: `order`, that of the Runge-Kutta steps, is not 3 or 4.
@@ -108,7 +108,8 @@ class Fleet:
             raise ValueError(f"there is no step of order {order}: 3 and 4 are known")
         alike: dict[tuple[tuple[str, ...], bool, int], list[int]] = defaultdict(list)
         for i, plant in enumerate(plants):
-            steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
+            own = substeps[i] if isinstance(substeps, Sequence) else substeps
+            steps = own if own is not None else steps_a_sample(dt_s, plant.vehicle)
             alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
         tasks: list[_Task] = []
         for (effects, fixed, steps), runs in alike.items():

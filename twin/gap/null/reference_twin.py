@@ -15,12 +15,16 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.coordinates import Coordinate
+from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
+from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.rollout.batch import INTEGRATOR_ORDER
 from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
     RunResiduals,
@@ -47,6 +51,9 @@ EFFECT_SIGMA = 0.1
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
 STEPS, TRIES, ENOUGH = 6, 4, 0.01
 """Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
+MOST_STEPS = 4
+"""Integration steps a sample beyond which ground is too hard or motors are too stiff to be tried: logs hardly
+tell them from softer ones, and all rollouts would take longer."""
 DAMPING, LESS, MORE = 1.0, 1.0 / 6.0, 8.0
 """First damping, as a share of the information, and its factors after a step that is better, or is not."""
 
@@ -87,13 +94,16 @@ class _Fit:
         )
 
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges."""
-        models, count = [self.model(w) for w in points], len(self.runs)
-        tried = [Rollout(run.log, {}, model=m) for m in models for run in self.runs]
-        found = aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs)
+        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or would need
+        more than `MOST_STEPS`."""
+        models, count, log = [self.model(w) for w in points], len(self.runs), self.runs[0].log
+        soft = [stable_steps(DT_S, plant_of(log, m), INTEGRATOR_ORDER) <= MOST_STEPS for m in models]
+        tried = [Rollout(r.log, {}, model=m) for m in itertools.compress(models, soft) for r in self.runs]
+        found = iter(aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs))
         out = list[list[Array] | None]()
-        for i in range(0, len(found), count):
-            pairs = zip(self.runs, found[i : i + count], strict=True)
+        for near in soft:
+            own = list(itertools.islice(found, count if near else 0))
+            pairs = zip(self.runs[: len(own)], own, strict=True)
             known = [
                 whitened_error(r, self.noise, r.residuals.errors_of(y)) for r, y in pairs if y is not None
             ]

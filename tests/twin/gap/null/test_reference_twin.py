@@ -9,10 +9,12 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.start import coordinates_of
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
-from terrafusion.twin.gap.null.reference_twin import RUNS, set_to_references
-from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals
+from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.null.reference_twin import RUNS, _Fit, set_to_references
+from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals, whitened
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.twin.gap.runs import DRIVE
@@ -64,3 +66,19 @@ def test_drives_of_another_twin_are_linearised_anew(fitted) -> None:
     plain = dataclasses.replace(found, effects=model.effects)
     keys = {LinearisationCache(m, CANDIDATES).key(logs[0]) for m in (model, plain, found)}
     assert len(keys) == 3
+
+
+def test_ground_that_is_too_hard_for_the_steps_is_not_tried() -> None:
+    """Half a millimetre of give: wheels at rest would shake."""
+    logs, model, _ = prepared(references()[:1], load_vehicle("elevate"), "loose_sand")
+    channels = tuple(o.channel for o in logs[0].observed)
+    cache = LinearisationCache(model, CANDIDATES)
+    runs = [run_residuals(logs[0], cache, channels)]
+    noise = learn_noise(runs, [], CANDIDATES)
+    numbers = coordinates_of(["soil.shear.shear_modulus_m"], model, {})
+    fit = _Fit(cache, noise, numbers, [whitened(runs[0].without_nuisance(), noise)], 1)
+    soft, hard = np.zeros(1), np.array([-12.0])
+    assert fit.model(hard).soils["loose_sand"].shear.shear_modulus_m < 5e-4
+    found = fit.errors([soft, hard, soft])
+    assert found[1] is None
+    assert all(some is not None and len(some) == 1 for some in (found[0], found[2]))
