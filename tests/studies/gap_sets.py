@@ -175,9 +175,10 @@ def make(number: int, jobs: int = 1) -> dict[str, Any]:
     base = 10_000_000 + 1000 * number
     references = [run(of, False, base + i) for i in range(of.references)]
     runs = [run(of, True, base + 500 + i) for i in range(of.runs)]
-    candidates = Candidates.of()
+    vehicle = load_vehicle(of.robot)
+    candidates = Candidates.of().sized_for(vehicle)
     with one_blas_thread():
-        evidence = gather_evidence(runs, references, load_vehicle(of.robot), of.soil, candidates, jobs=jobs)
+        evidence = gather_evidence(runs, references, vehicle, of.soil, candidates, jobs=jobs)
         sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
         robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
         drives = drive_coverage(evidence.runs, evidence.references, evidence.model)

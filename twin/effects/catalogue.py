@@ -11,6 +11,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.form import STAGES, Form, Parameter
 
 _OWN: dict[str, Form] = {}
+MOST_GROWTH = 40.0
+"""Load of a wheel times its radius of the largest robot, over that of the nominal one."""
 
 
 @functools.cache
@@ -122,12 +124,12 @@ def checked(values: Mapping[str, float]) -> dict[str, float]:
     out: dict[str, float] = {}
     for key, value in sorted(by_key(values).items()):
         _, parameter = lookup(key)
-        if not (
-            isinstance(value, Real) and math.isfinite(value) and parameter.low <= value <= parameter.high
-        ):
+        most = MOST_GROWTH if parameter.grows else 1.0
+        low, high = most * parameter.low, most * parameter.high
+        if not (isinstance(value, Real) and math.isfinite(value) and low <= value <= high):
             raise ConfigError(
                 f"effect '{key}' is {value}, out of range",
-                remedy=f"give {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip(),
+                remedy=f"give {low:g} to {high:g} {parameter.unit}".rstrip(),
             )
         if value != 0.0:
             out[key] = float(value)

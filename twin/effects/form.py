@@ -62,6 +62,9 @@ SENSOR_STAGES = ("mounting", "measurement", "stamp")
 """Stages that change what is measured and not how the robot moves."""
 
 
+NOMINAL_KG, NOMINAL_RADIUS_M = 32.0, 0.175  # of the vehicle "elevate"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A number of a form; zero means that its term is absent.
@@ -71,6 +74,8 @@ class Parameter:
         scale: typical size (standard deviation of a prior).
         low, high: closed range of values a run may be made with.
         name: within the form; "" where it is the only one.
+        grows: whether size and range are those of a robot of `NOMINAL_KG` on wheels of `NOMINAL_RADIUS_M` and
+            grow with the load of a wheel times its radius.
     """
 
     unit: str
@@ -78,6 +83,7 @@ class Parameter:
     low: float
     high: float
     name: str = ""
+    grows: bool = False
 
 
 @dataclass(frozen=True, eq=False)

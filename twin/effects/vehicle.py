@@ -167,7 +167,7 @@ FORMS = (
         "torque e tanh(w / 0.1 rad/s) against rotation, each wheel", "Coulomb, smoothed",
     ),
     Form(
-        "drivetrain_friction", "dry", one("N m", 0.3, 0.0, 5.0), {"ground": _dry},
+        "drivetrain_friction", "dry", (Parameter("N m", 0.3, 0.0, 7.0, grows=True),), {"ground": _dry},
         "torque e against rotation, each wheel, which holds at rest", "Dahl 1968, as the rolling resistance",
     ),
     Form(

@@ -82,7 +82,7 @@ def diagnose(
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     check_source(source)
     check_distinct([*runs, *references])
-    candidates = Candidates.of(effects, vehicle.effects)
+    candidates = Candidates.of(effects, vehicle.effects).sized_for(vehicle)
     evidence = gather_evidence(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, cache=cache
     )
