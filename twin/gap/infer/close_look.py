@@ -1,15 +1,14 @@
 """Close look at a few laws: alone and in pairs, each with the discrepancy of its form.
 
 A law is never quite the robot's. Its signature times functions of the commands, which a law of another form
-would depend on, joins the covariance in proportion to the size of the effect (after Kennedy and O'Hagan 2001,
-with a basis in place of a Gaussian process).
+would depend on, and its signature in each channel by itself join the covariance in proportion to the size of
+the effect (after Kennedy and O'Hagan 2001, with a basis in place of a Gaussian process).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,35 +19,51 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.infer.bank import SignatureBank
 from terrafusion.twin.gap.infer.predictive import Metric, Products
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
-from terrafusion.twin.gap.rollout.nuisance import BASIS, command_basis
+from terrafusion.twin.gap.rollout.nuisance import BASIS, CHANNEL_NAMES, command_basis
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 FUNCTIONS = ("speed", "abs_turn", "turn_rate", "acceleration")
 """Factors of a law's signature, with time, each of mean zero and variance one over a run."""
-DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a fifth of the signature)
+DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a quarter of the signature)
+ROUNDS, SAME = 4, 0.03
+"""Most fits of laws, each with the discrepancy of the sizes before, and by what share these may differ."""
 PAIRS, FIRST = 30, 5
 """Pairs that are fitted: the best to first sight, and all of the best laws."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloseLook:
-    """Laws examined, by index, and the columns of the discrepancy of each in the metric."""
+    """Laws examined, by index; columns of the discrepancy of each in the metric, and the norm of its values
+    for which these are."""
 
     metric: Metric
     laws: Laws
     index: tuple[int, ...]
     extra: Mapping[int, Array]
+    size: Mapping[int, float]
 
     def fit(self, laws: Sequence[int]) -> Fitted:
-        """Some laws together, with the discrepancy of each in the covariance."""
+        """Some laws together, with the discrepancy of each, in proportion to its size, in the covariance."""
+        share = np.ones(len(laws))
+        for _ in range(ROUNDS):
+            found = self._fit(laws, share)
+            pairs = zip(laws, found.values, strict=True)
+            before, share = share, np.array([np.linalg.norm(v) / max(self.size[i], 1e-9) for i, v in pairs])
+            if np.allclose(share, before, atol=SAME):
+                break
+        return found
+
+    def _fit(self, laws: Sequence[int], share: Array) -> Fitted:
+        """With discrepancies of shares (k,) of the given sizes."""
         D, K, e = np.concatenate([self.extra[i] for i in laws]), self.metric.K, self.metric.error
-        L = np.linalg.cholesky(K[np.ix_(D, D)] + np.eye(len(D)) / DISCREPANCY**2)
-        half = np.linalg.solve(L, K[D])
+        sigma = DISCREPANCY * np.repeat(share, [len(self.extra[i]) for i in laws])
+        L = np.linalg.cholesky(sigma[:, None] * K[np.ix_(D, D)] * sigma + np.eye(len(D)))
+        half = np.linalg.solve(L, sigma[:, None] * K[D])
         less = half.T @ half
         found = self.laws.fit(Metric(K - less, self.metric.shared), laws)
         # What the discrepancy adds to the log likelihood of no effect.
-        share = 0.5 * float(less[e, e]) - float(np.log(np.diag(L)).sum()) - len(D) * math.log(DISCREPANCY)
-        return dataclasses.replace(found, gain=found.gain + share, evidence=found.evidence + share)
+        more = 0.5 * float(less[e, e]) - float(np.log(np.diag(L)).sum())
+        return dataclasses.replace(found, gain=found.gain + more, evidence=found.evidence + more)
 
     def search(self) -> dict[tuple[int, ...], Fitted]:
         """Fits of all laws alone and of all pairs that look promising."""
@@ -83,13 +98,15 @@ def products_with_discrepancy(
         used: (M + 1,) coefficients of each law's signature at its size.
         weight: (C,) of each channel: one over the factor of its noise's variance.
     """
-    columns, F, out = bank.columns(), len(FUNCTIONS) + 1, list[Products]()
+    columns, out = bank.columns(), list[Products]()
     first = runs[0].by_parameter.shape[1] + columns[0].shape[1]
     for run, signatures in zip(runs, columns, strict=True):
-        f, own = modulation(run, model), np.column_stack([run.by_parameter, signatures])
+        f = np.column_stack([modulation(run, model), by_sensor(run)])
+        own = np.column_stack([run.by_parameter, signatures])
         parts = [(own @ w[: own.shape[1]])[:, None] * f for w in used.values()]
         root = np.sqrt(weight)[run.channel][:, None]
         out.append(Products.of(run.weighted(weight), root * np.column_stack([signatures, *parts])))
+    F = f.shape[1]
     return out, {i: first + F * k + np.arange(F) for k, i in enumerate(used)}
 
 
@@ -98,3 +115,11 @@ def modulation(run: WhitenedRun, model: Model) -> Array:
     f = np.column_stack([command_basis(run.log, model, run.time_s), run.time_s])
     f = f[:, [*map(BASIS.index, FUNCTIONS), -1]]
     return np.asarray((f - f.mean(axis=0)) / np.maximum(f.std(axis=0), 1e-9))
+
+
+def by_sensor(run: WhitenedRun) -> Array:
+    """(n, S) which of the log's channels a sample is of; the wheels of both sides are one."""
+    names = [CHANNEL_NAMES[o.channel] for o in run.log.observed]
+    names = ["wheels" if name.startswith("wheel") else name for name in names]
+    of_sample = np.array(names)[run.channel]
+    return np.column_stack([of_sample == name for name in dict.fromkeys(names)]).astype(float)

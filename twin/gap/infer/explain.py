@@ -194,17 +194,25 @@ def explain(
     # The most promising laws alone, simulated where no size is near the best one.
     sizes = own.promising(look, alone, FIRST)
     bank = own.with_best_sizes(look, sizes).only(look.laws.names[i] for i in sizes)
-    look = own.look(bank)
-    _, _, used = look.laws.best(look.metric)
-    # Close look: alone and in pairs, each with the discrepancy of its law.
-    wanted, weight = {i: used[i] for i in sizes}, np.ones(len(evidence.channels))
+    return _close_look(own, bank, tuple(sizes), alone)
+
+
+def _close_look(
+    own: _Explainer, bank: SignatureBank, index: tuple[int, ...], alone: Mapping[int, Fitted]
+) -> Explanation:
+    """Promising laws, by index, alone and in pairs, with their discrepancies; `alone` are fits of all laws
+    without it."""
+    evidence, look = own.evidence, own.look(bank)
+    _, values, used = look.laws.best(look.metric)
+    wanted, weight = {i: used[i] for i in index}, np.ones(len(evidence.channels))
+    size = {i: float(np.linalg.norm(values[i])) for i in index}
     normal = own.normal_energies()
     plain = list[Products]()
     for _ in range(WEIGHINGS):
         runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, wanted, weight)
         plain, look = plain or runs, own.look(bank, runs)
         laws = look.laws
-        found = CloseLook(look.metric, laws, tuple(sizes), extra).search()
+        found = CloseLook(look.metric, laws, index, extra, size).search()
         top = max(found, key=lambda some: found[some].evidence - 5.0 * len(some))
         before, weight = weight, own.weights(look, found[top], normal)
         if np.allclose(before, weight, rtol=0.1):
@@ -214,10 +222,10 @@ def explain(
         if len(runs) == 1:
             return [fit.values]
         some = [laws.names.index(law) for law in fit.laws]
-        parts = [metric([r for r in runs if r is not run], sigma, robot) for run in runs]
+        parts = [metric([r for r in runs if r is not run], own.sigma, own.robot) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(plain, [found[i,] for i in sizes])
+    alike = _same_signatures(plain, [found[i,] for i in index])
     return _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
 
 

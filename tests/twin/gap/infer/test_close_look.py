@@ -1,0 +1,57 @@
+"""The discrepancy of a law: in proportion to its size, and in each channel by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.infer.close_look import CloseLook, by_sensor
+from terrafusion.twin.gap.infer.predictive import Metric
+from terrafusion.twin.gap.infer.single_effects import Laws
+from tests.twin.gap.infer.test_single_effects import CANDIDATES, law, noise, problem
+
+SCALE = law("gyro_scale", "scale")
+GIVEN = 20.0  # size at which the discrepancy is given
+
+
+def close_look(columns: np.ndarray, discrepancy: np.ndarray, error: np.ndarray) -> CloseLook:
+    """At one law, whose discrepancy has these columns (n, D) at the size `GIVEN`."""
+    X = np.column_stack([columns, discrepancy, error])
+    m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
+    extra = columns.shape[1] + np.arange(discrepancy.shape[1])
+    return CloseLook(m, Laws.of(CANDIDATES, {}, m.shared, m.none), (SCALE,), {SCALE: extra}, {SCALE: GIVEN})
+
+
+def setting() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns of the effects, the law's signature, and which half of the samples are of one channel."""
+    columns = problem(5)[0]
+    half = (np.arange(len(columns)) % 2).astype(float)
+    return columns, columns[:, CANDIDATES.hypotheses[SCALE].columns[0]], half
+
+
+def test_a_law_of_no_size_explains_nothing_by_its_discrepancy() -> None:
+    columns, signature, half = setting()
+    shape = GIVEN * signature * np.sign(np.sin(np.arange(len(half))))
+    other = 0.1 * (shape - signature * (signature @ shape) / (signature @ signature))
+    fit = close_look(columns, shape[:, None], other + noise(5)).fit((SCALE,))
+    assert abs(fit.values[0][0]) < 0.5
+    assert fit.gain < 0.05 * float(other @ other)
+
+
+@pytest.mark.parametrize("size", [2.0, 10.0, 22.0])
+def test_what_a_law_leaves_in_one_channel_is_in_proportion_to_its_size(size: float) -> None:
+    columns, signature, half = setting()
+    error = size * signature * (0.9 + 0.2 * half) + noise(6)
+    fit = close_look(columns, GIVEN * (signature * half)[:, None], error).fit((SCALE,))
+    whole = 0.5 * float(error @ error) - 0.5 * len(error)
+    assert fit.gain > 0.99 * whole - 15.0
+    assert fit.values[0][0] == pytest.approx(size, rel=0.2)
+
+
+def test_wheels_of_both_sides_are_one_sensor() -> None:
+    from types import SimpleNamespace as Stub
+
+    names = ("wheel_left_radps", "wheel_right_radps", "yaw_rate_radps", "gnss_east_m", "gnss_north_m")
+    run = Stub(log=Stub(observed=[Stub(channel=name) for name in names]), channel=np.arange(5))
+    found = by_sensor(run)  # type: ignore[arg-type]
+    assert found.T.tolist() == [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 1]]
