@@ -71,6 +71,18 @@ def test_without_a_gap_p_values_are_uniform(drive: str, judged: int) -> None:
     assert kstest(found, "uniform", alternative="greater").pvalue > 0.001, "smaller than uniform: alarms"
 
 
+@pytest.mark.parametrize("changed", [1, 3])
+def test_a_gap_shows_without_any_one_of_three_runs(changed: int) -> None:
+    """One that is odd by itself is none."""
+    found = []
+    for seed in range(20):
+        references, runs = trial(seed, "reference", judged=3)
+        _, odd = trial(seed, "reference", effect=3.0, judged=3)
+        offsets = learn_offsets(references, len(CANDIDATES.keys))
+        found.append(detect([*odd[:changed], *runs[changed:]], offsets, CANDIDATES, seed).p_value <= 0.05)
+    assert np.mean(found) <= 0.1 if changed == 1 else np.mean(found) >= 0.9
+
+
 @pytest.mark.parametrize("drive", ["reference", "other"])
 def test_an_effect_is_seen_on_either_drive(drive: str) -> None:
     found = [p_value(i, drive, effect=3.0) for i in range(20)]
