@@ -43,20 +43,25 @@ class CloseLook:
     size: Mapping[int, float]
 
     def fit(self, laws: Sequence[int]) -> Fitted:
-        """Some laws together, with the discrepancy of each, in proportion to its size, in the covariance."""
+        """Some laws together, with the discrepancy of each, in proportion to its size, in the covariance.
+
+        Sizes are those without a discrepancy by channel: where channels differ, it would leave them to those
+        that show least.
+        """
         share = np.ones(len(laws))
         for _ in range(ROUNDS):
-            found = self._fit(laws, share)
+            found = self._fit(laws, share, len(FUNCTIONS) + 1)
             pairs = zip(laws, found.values, strict=True)
             before, share = share, np.array([np.linalg.norm(v) / max(self.size[i], 1e-9) for i, v in pairs])
             if np.allclose(share, before, atol=SAME):
                 break
-        return found
+        whole = self._fit(laws, share)
+        return dataclasses.replace(found, gain=whole.gain, evidence=whole.evidence)
 
-    def _fit(self, laws: Sequence[int], share: Array) -> Fitted:
-        """With discrepancies of shares (k,) of the given sizes."""
-        D, K, e = np.concatenate([self.extra[i] for i in laws]), self.metric.K, self.metric.error
-        sigma = DISCREPANCY * np.repeat(share, [len(self.extra[i]) for i in laws])
+    def _fit(self, laws: Sequence[int], share: Array, first: int | None = None) -> Fitted:
+        """With discrepancies of shares (k,) of the given sizes: the first columns of each, or all."""
+        D, K, e = np.concatenate([self.extra[i][:first] for i in laws]), self.metric.K, self.metric.error
+        sigma = DISCREPANCY * np.repeat(share, [len(self.extra[i][:first]) for i in laws])
         L = np.linalg.cholesky(sigma[:, None] * K[np.ix_(D, D)] * sigma + np.eye(len(D)))
         half = np.linalg.solve(L, sigma[:, None] * K[D])
         less = half.T @ half

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.gap.infer.close_look import CloseLook, by_sensor
+from terrafusion.twin.gap.infer.close_look import FUNCTIONS, CloseLook, by_sensor
 from terrafusion.twin.gap.infer.predictive import Metric
 from terrafusion.twin.gap.infer.single_effects import Laws
 from tests.twin.gap.infer.test_single_effects import CANDIDATES, law, noise, problem
@@ -15,10 +15,12 @@ GIVEN = 20.0  # size at which the discrepancy is given
 
 
 def close_look(columns: np.ndarray, discrepancy: np.ndarray, error: np.ndarray) -> CloseLook:
-    """At one law, whose discrepancy has these columns (n, D) at the size `GIVEN`."""
-    X = np.column_stack([columns, discrepancy, error])
+    """At one law, whose discrepancy by channel has these columns (n, D) at the size `GIVEN`; there is none by
+    functions of the commands."""
+    F = len(FUNCTIONS) + 1
+    X = np.column_stack([columns, np.zeros((len(error), F)), discrepancy, error])
     m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
-    extra = columns.shape[1] + np.arange(discrepancy.shape[1])
+    extra = columns.shape[1] + np.arange(F + discrepancy.shape[1])
     return CloseLook(m, Laws.of(CANDIDATES, {}, m.shared, m.none), (SCALE,), {SCALE: extra}, {SCALE: GIVEN})
 
 
@@ -46,6 +48,16 @@ def test_what_a_law_leaves_in_one_channel_is_in_proportion_to_its_size(size: flo
     whole = 0.5 * float(error @ error) - 0.5 * len(error)
     assert fit.gain > 0.99 * whole - 15.0
     assert fit.values[0][0] == pytest.approx(size, rel=0.2)
+
+
+def test_a_size_is_that_of_the_channel_that_shows_most() -> None:
+    columns, signature, half = setting()
+    strength = np.where(half == 1.0, 1.0, 0.2)
+    columns = columns * strength[:, None]
+    error = signature * strength * np.where(half == 1.0, 10.0, 20.0) + 0.1 * noise(7)
+    by_channel = GIVEN * (signature * strength)[:, None] * np.column_stack([half, 1.0 - half])
+    fit = close_look(columns, by_channel, error).fit((SCALE,))
+    assert fit.values[0][0] == pytest.approx(10.4, abs=0.3)
 
 
 def test_wheels_of_both_sides_are_one_sensor() -> None:
