@@ -21,8 +21,8 @@ from terrafusion.twin.gap.answer.next_run import (
     LIFTED,
     PAYLOAD,
     Planner,
-    _forecast,
     drives,
+    forecast_runs,
 )
 from terrafusion.twin.gap.answer.verdict import UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
@@ -267,8 +267,8 @@ def test_lifted_wheels_carry_no_load(wide: GapDiagnosis) -> None:
     e = wide.evidence
     columns = [e.candidates.keys.index(f"motion_resistance/{form}") for form in ("in_motion", "with_speed")]
     strength = {
-        name: np.abs(_forecast(e, name, {"motion_resistance"}).by_parameter[:, columns]).max()
-        for name in (LIFTED, "speed staircase")
+        name: np.abs(run.by_parameter[:, columns]).max()
+        for name, run in forecast_runs(e, (LIFTED, "speed staircase"), {"motion_resistance"}).items()
     }
     assert strength[LIFTED] == 0.0
     assert strength["speed staircase"] > 0.1
@@ -281,7 +281,7 @@ def _separations(d: GapDiagnosis, one: str, other: str, *names: str) -> list[flo
     planner = Planner.of(e, sigma, robot, [score(r, sigma) for r in e.runs])
     by_name = {c.effect: c for c in d.verdict.causes}
     causes = [dataclasses.replace(by_name[n], value=np.ones(len(by_name[n].columns))) for n in (one, other)]
-    more = [planner.forecast(n, {one, other}) if n else 0.0 for n in names]
+    more = [planner.forecast((n,), {one, other})[n] if n else 0.0 for n in names]
     return [planner.separation(causes[0], causes[1], m) for m in more]
 
 

@@ -14,7 +14,6 @@ from typing import Self
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.printable import times
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.calibrate.inputs import DT_S
@@ -23,14 +22,13 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
-from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.infer.law_misfit import GROUND
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import marginalise_robot_offsets, marginalise_run_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
-from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
+from terrafusion.twin.gap.rollout.sensitivities import Course, channel_sensitivities, linearise_all
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.file import scenario_of
@@ -94,8 +92,7 @@ class Planner:
     def propose(self, one: Cause, other: Cause) -> NextRun:
         """The drive on which two causes differ most; a direct measurement where none separates them."""
         effects = {one.effect, other.effect}
-        information = in_threads(self.evidence.jobs, lambda name: self.forecast(name, effects), drives())
-        found = dict(zip(drives(), information, strict=True))
+        found = self.forecast(tuple(drives()), effects)
 
         def sigmas(name: str, repeats: int = 1) -> float:
             return self.separation(one, other, repeats * found[name])
@@ -137,19 +134,16 @@ class Planner:
         explained = max(_explained(information, signal, h.columns) for h in c.hypotheses if h.effect == other)
         return math.sqrt(max(square - explained, 0.0))
 
-    def forecast(self, name: str, effects: set[str]) -> Array:
-        """Information (P, P) of a drive on some effects; zero where the twin diverges on it."""
-        P = len(self.known)
-        try:
-            own = score(_forecast(self.evidence, name, effects), self.sigma)
-        except TerrafusionError:
-            return np.zeros((P, P))
-        information = marginalise_run_offsets(own.A, self.robot)
-        if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
-            keys = self.evidence.candidates.keys
-            ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]
-            information[ground, :] = information[:, ground] = 0.0
-        return information
+    def forecast(self, names: Sequence[str], effects: set[str]) -> dict[str, Array]:
+        """Information (P, P) of drives on some effects; zero where the twin diverges."""
+        out = dict.fromkeys(names, np.zeros((len(self.known),) * 2))
+        for name, run in forecast_runs(self.evidence, names, effects).items():
+            out[name] = information = marginalise_run_offsets(score(run, self.sigma).A, self.robot)
+            if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
+                keys = self.evidence.candidates.keys
+                ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]
+                information[ground, :] = information[:, ground] = 0.0
+        return out
 
 
 def _explained(information: Array, signal: Array, columns: Sequence[int]) -> float:
@@ -160,12 +154,25 @@ def _explained(information: Array, signal: Array, columns: Sequence[int]) -> flo
     return float(signal[b] @ np.linalg.solve(within, signal[b]))
 
 
-def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRun:
-    """Sensitivities of a drive that has not been driven: its errors are zero."""
+def forecast_runs(evidence: GapEvidence, names: Sequence[str], effects: set[str]) -> dict[str, WhitenedRun]:
+    """Sensitivities of drives that have not been driven: their errors are zero. None of one on which the twin
+    diverges."""
+    candidates, courses = evidence.candidates, [course_of(evidence, name, effects) for name in names]
+    out = dict[str, WhitenedRun]()
+    for name, own, run in zip(names, courses, linearise_all(courses, candidates), strict=True):
+        if run is not None:
+            found = channel_sensitivities(own.log, run)
+            residuals = residuals_from(own.log, found, own.model, candidates, evidence.channels)
+            out[name] = whitened(residuals, evidence.noise)
+    return out
+
+
+def course_of(evidence: GapEvidence, name: str, effects: set[str]) -> Course:
+    """A drive by the twin, with the columns of some effects."""
     template, model, scenario = evidence.runs[0].log, evidence.model, drives()[name]
     label = template.labels[0]
     if name == LIFTED:
-        model = _lifted(model, label)
+        model, effects = _lifted(model, label), effects - GROUND
     elif PAYLOAD in name:
         payload_kg = model.payload_kg + PAYLOAD_SHARE * model.vehicle.body.mass_kg
         model = dataclasses.replace(model, payload_kg=payload_kg)
@@ -178,12 +185,8 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
         name, inputs[:, :2], template.follows, (label,), np.zeros(0), windows,
         np.zeros((len(windows), 3)), tuple(_empty(o, end) for o in template.observed), True, (),
     )  # fmt: skip
-    candidates = evidence.candidates
-    if name == LIFTED:
-        effects = effects - GROUND
-    keys = {k for k in candidates.keys if k.split("/")[0] in effects or k in SOIL_SIGMAS}
-    found = channel_sensitivities(log, linearise(log, model, candidates, log.start, keys))
-    return whitened(residuals_from(log, found, model, candidates, evidence.channels), evidence.noise)
+    keys = {k for k in evidence.candidates.keys if k.split("/")[0] in effects or k in SOIL_SIGMAS}
+    return Course(log, model, log.start, keys)
 
 
 def _lifted(model: Model, label: str) -> Model:

@@ -25,6 +25,7 @@ from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.batch import (
     GROUP_SIZE,
     NOMINAL,
+    Lane,
     MotionEffects,
     SampledSensors,
     assign_graphs,
@@ -166,24 +167,90 @@ def _batches(
     return out
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Course:
+    """What is linearised: a log, the model, poses (W, 3) at the windows' starts, and keys of the columns to
+    compute, the others are zero; None: all."""
+
+    log: PreparedLog
+    model: Model
+    start: Array
+    only: Collection[str] | None = None
+
+    def steps(self, candidates: Candidates) -> dict[str, float]:
+        """Step of each parameter, in its unit."""
+        known = self.model.effects
+        return {k: _step(candidates, i, known.get(k, 0.0), self.log) for i, k in enumerate(candidates.keys)}
+
+    def effects(self, candidates: Candidates) -> dict[str, dict[str, float]]:
+        """Effects of each run that is made, by the key that differs."""
+        own, steps = self.model.effects, self.steps(candidates)
+        wanted = {k: step for k, step in steps.items() if self.only is None or k in self.only}
+        return {NOMINAL: dict(own)} | {k: {**own, k: own.get(k, 0.0) + x} for k, x in wanted.items()}
+
+
 def linearise(
     log: PreparedLog, model: Model, candidates: Candidates, start: Array, only: Collection[str] | None = None
 ) -> Linearisation:
-    """The twin's run at the model's own effects, with its derivatives.
-
-    Args:
-        only: keys of the columns to compute, the others are zero; None: all.
+    """The twin's run at the model's own effects, with its derivatives; arguments as those of `Course`.
 
     Raises:
         TerrafusionError: the run diverged.
     """
-    sets = {NOMINAL: dict(model.effects)}
-    steps = {k: _step(candidates, i, model.effects.get(k, 0.0), log) for i, k in enumerate(candidates.keys)}
-    for k, step in steps.items():
-        if only is None or k in only:
-            sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
-    fine, coarse, read = _readings(log, model, candidates, start, sets)
-    y = read[NOMINAL]
+    (found,) = linearise_all([Course(log, model, start, only)], candidates)
+    if found is None:
+        raise TerrafusionError(
+            "the twin diverges on this log",
+            file=log.name,
+            remedy="check the vehicle's and the soil's numbers",
+        )
+    return found
+
+
+def linearise_all(courses: Sequence[Course], candidates: Candidates) -> list[Linearisation | None]:
+    """Each as if alone, None where its run diverges; the runs of all are simulated together."""
+    driven: list[dict[str, _Driven]] = [{} for _ in courses]
+    effects, several = [course.effects(candidates) for course in courses], len(courses) > 1
+    for group in effect_groups(candidates):
+        pairs = [(i, k) for i, some in enumerate(effects) for k in group if k in some]
+        given = [(courses[i].log, courses[i].model, effects[i][k], courses[i].start) for i, k in pairs]
+        lanes, every = make_lanes(given, candidates, group), several or NOMINAL in group
+        # Runs of several logs are stopped where a window of any of them ends: between coarse samples, too.
+        states = simulate_lanes(lanes, 1 if every else COARSE_STEP) if lanes else []
+        for (i, k), lane, x in zip(pairs, lanes, states, strict=True):
+            coarse = x[coarse_subset(lane.log)] if every else x
+            driven[i][k] = _Driven(lane, coarse, group, x if k == NOMINAL else None)
+    return [_linearisation(*own, candidates) for own in zip(courses, effects, driven, strict=True)]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Driven:
+    """A simulated run: states (n, X) at the coarse samples, the effects of its graph, states (N, X) at all
+    samples for the nominal one."""
+
+    lane: Lane
+    coarse: Array
+    group: tuple[str, ...]
+    fine: Array | None
+
+
+def _linearisation(
+    course: Course,
+    effects: Mapping[str, Mapping[str, float]],
+    driven: Mapping[str, _Driven],
+    candidates: Candidates,
+) -> Linearisation | None:
+    log, model, twin = course.log, course.model, driven[NOMINAL]
+    if twin.fine is None or not np.isfinite(twin.fine).all():
+        return None
+    every = SampledSensors(log, model, candidates, log.samples())
+    fine = every.read(twin.fine, twin.lane.plant, twin.lane.inputs, effects[NOMINAL])
+    sensors, read = SampledSensors(log, model, candidates, log.samples(COARSE_STEP)), dict[str, Array]()
+    for k, own in driven.items():
+        read[k] = sensors.read(own.coarse, own.lane.plant, own.lane.inputs, effects[k], own.group)
+    for k in effects.keys() - read.keys():  # effects of the sensors alone
+        read[k] = sensors.read(twin.coarse, twin.lane.plant, twin.lane.inputs, effects[k])
+    y, steps = read[NOMINAL], course.steps(candidates)
     slopes = {
         k: (read[k] - y) * (scale / steps[k])
         for k, scale in zip(candidates.keys, candidates.scale, strict=True)
@@ -191,44 +258,11 @@ def linearise(
     }
     by_patch, K = patch_columns(y, slopes, coarse_counts(log), model.vehicle.body.track_m), len(steps)
     columns = np.zeros((*y.shape, 3 + K + by_patch.shape[2]))
-    columns[:, :, :3], columns[:, :, 3 + K :] = _by_pose(log, coarse, y), by_patch
+    columns[:, :, :3], columns[:, :, 3 + K :] = _by_pose(log, twin.coarse, y), by_patch
     for i, k in enumerate(candidates.keys, start=3):
         if k in slopes:
             columns[:, :, i] = slopes[k]
-    return Linearisation(start, fine, columns, coarse[:, INDEX["yaw"]])
-
-
-def _readings(
-    log: PreparedLog,
-    model: Model,
-    candidates: Candidates,
-    start: Array,
-    sets: Mapping[str, Mapping[str, float]],
-) -> tuple[Array, Array, dict[str, Array]]:
-    """Nominal outputs at every grid sample, nominal states (n, X) at the coarse ones, and there the outputs
-    (n, Y) with each set of effects."""
-    sensors, read = SampledSensors(log, model, candidates, log.samples(COARSE_STEP)), dict[str, Array]()
-    for group in effect_groups(candidates):
-        keys = [k for k in group if k in sets]
-        nominal = NOMINAL in keys
-        lanes = make_lanes([(log, model, sets[k], start) for k in keys], candidates, group)
-        states = simulate_lanes(lanes, 1 if nominal else COARSE_STEP) if keys else []
-        if nominal:
-            if not np.isfinite(states[0]).all():
-                raise TerrafusionError(
-                    "the twin diverges on this log",
-                    file=log.name,
-                    remedy="check the vehicle's and the soil's numbers",
-                )
-            every = SampledSensors(log, model, candidates, log.samples())
-            fine = every.read(states[0], lanes[0].plant, lanes[0].inputs, sets[NOMINAL])
-            states = [x[coarse_subset(log)] for x in states]
-            coarse, twin = states[0], lanes[0]
-        for k, x, lane in zip(keys, states, lanes, strict=True):
-            read[k] = sensors.read(x, lane.plant, lane.inputs, sets[k], group)
-    for k in sets.keys() - read.keys():  # effects of the sensors alone
-        read[k] = sensors.read(coarse, twin.plant, twin.inputs, sets[k])
-    return fine, coarse, read
+    return Linearisation(course.start, fine, columns, twin.coarse[:, INDEX["yaw"]])
 
 
 def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitivity]:
