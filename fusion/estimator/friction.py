@@ -45,6 +45,9 @@ PRIOR_MPS2, PRIOR_SPREAD = 1.0, 0.7
 (assumed)."""
 ROLLING_PRIOR = 0.9
 """Prior probability that the wheels hold: half rolling, half the limits of dry ground (assumed)."""
+LATE_S, LATE = (0.25, 0.5, 1.0, 1.5), 0.2
+"""Delays of the fixes of wheels that hold, and their prior share (assumed): in turns and starts late fixes look
+like a skid."""
 LEAST_INTERVAL_S, LONGEST_INTERVAL_S = 0.9, 1.6
 """Interval between the fixes that are compared."""
 PATH_SHARE, PATH_SIGMA_M = 0.1, 0.05
@@ -58,8 +61,8 @@ SKID_DENSITY_MPS2 = 0.3
 s."""
 SKID_S = 1.0
 """Duration of a skid in one direction (assumed), over which the error of a wrong limit accumulates."""
-KEPT_S = 3.0
-"""Paths and links are kept for longer than the interval between fixes."""
+KEPT_S = 5.0
+"""Paths and links are kept for longer than the interval between fixes and their delay."""
 REPORT_STEP = 0.2
 """Relative change of the friction limit that is reported."""
 _STEP_MPS = 0.01
@@ -87,7 +90,9 @@ class FrictionEstimator:
         dry = np.full(
             len(FRICTION_MPS2) - len(SLIPPERY), 0.5 * ROLLING_PRIOR / (len(FRICTION_MPS2) - len(SLIPPERY))
         )
-        self._base = np.log([*(1.0 - ROLLING_PRIOR) * prior / prior.sum(), *dry, 0.5 * ROLLING_PRIOR])
+        late = np.full(len(LATE_S), LATE / len(LATE_S))
+        rolling = 0.5 * ROLLING_PRIOR * np.append(1.0 - LATE, late)
+        self._base = np.log([*(1.0 - ROLLING_PRIOR) * prior / prior.sum(), *dry, *rolling])
         self._score = np.zeros(len(self._base))
         self._velocity: Array | None = None
         self._paths: deque[tuple[int, Array]] = deque()
@@ -101,8 +106,8 @@ class FrictionEstimator:
     def probabilities(self) -> Array:
         """Probabilities (K + 1,) of the friction models and, last, of rolling wheels."""
         log_weight = self._base + self._score
-        weight = np.exp(log_weight - log_weight.max())
-        return np.asarray(weight / weight.sum())
+        weight, k = np.exp(log_weight - log_weight.max()), len(FRICTION_MPS2)
+        return np.append(weight[:k], weight[k:].sum()) / weight.sum()
 
     def _leading(self) -> slice | None:
         """The leading models: of slippery ground where likely, all where friction is nearly certain."""
@@ -134,7 +139,7 @@ class FrictionEstimator:
 
         `scale` is the scatter of the fixes over their reported sigma.
         """
-        here = self._paths_at(fix.t_ns)
+        here = self._places_at(fix.t_ns)
         if here is None or (self._fixes and fix.t_ns <= self._fixes[-1][0]):
             return
         sigma_m = scale * np.asarray(fix.sigma_m[:2])
@@ -157,6 +162,18 @@ class FrictionEstimator:
         fixes = 1 + sum(1 for t_ns, *_ in self._fixes if self._fixes[-1][0] - t_ns < LEAST_INTERVAL_S * 1e9)
         self._score -= 0.5 * (FREEDOM + 2.0) * np.log1p(square / FREEDOM) / fixes
         self._score -= self._score.max()
+
+    def _places_at(self, t_ns: int) -> Array | None:
+        """Where each model, and rolling wheels with late fixes, expect a fix, (K + 1 + len(LATE_S), 2).
+
+        None outside the kept paths, before which the robot is taken to stand.
+        """
+        on_time = self._paths_at(t_ns)
+        if on_time is None:
+            return None
+        begin_ns = self._paths[0][0]
+        late = (self._paths_at(max(t_ns - round(late_s * 1e9), begin_ns)) for late_s in LATE_S)
+        return np.vstack([on_time, *(places[-1:] for places in late if places is not None)])
 
     def _paths_at(self, t_ns: int) -> Array | None:
         """Antenna paths (K + 1, 2) at a time; None outside the kept interval."""
@@ -215,7 +232,7 @@ class FrictionEstimator:
         R = before.pose.rotation().matrix()
         if self._velocity is None:
             self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
-            here = np.tile((R @ self.antenna_m)[:2], (len(self._base), 1))
+            here = np.tile((R @ self.antenna_m)[:2], (len(FRICTION_MPS2) + 1, 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
         self._velocity, moved_m = skid_motion(self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s)
         rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _lateral_m(wheels, before)]

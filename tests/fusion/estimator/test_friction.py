@@ -267,6 +267,29 @@ def test_the_grip_of_a_robot_that_speeds_up(true_mps2: float) -> None:
     assert robot.told[-1].after == pytest.approx(robot.friction.mps2, rel=friction.REPORT_STEP)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.5, 1.0, 1.4])
+def test_late_fixes_on_ground_that_holds_are_no_skid(late_s: float) -> None:
+    """A robot that starts and stops: fixes follow its wheels as a sliding robot would."""
+    grip, places = Straight().friction, [np.zeros(3)]
+    for k in range(1, 301):
+        speed_mps = 1.5 if k % 80 > 40 else 0.0
+        wheels = WheelIncrement(np.array([0.1 * speed_mps, 0.0, 0.0]), np.full(4, 0.01), 0.1 * speed_mps, 0.0)
+        velocity = np.array([speed_mps, 0.0, 0.0])
+        state = KeyState(
+            gtsam.Pose3(gtsam.Rot3(), places[-1]),
+            velocity,
+            gtsam.imuBias.ConstantBias(),
+            np.zeros(len(LINEAR)),
+        )
+        segments = [ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
+        grip.step(k * 10**8, 0.1, segments, wheels, state, np.eye(21) * 1e-4, 0.0)
+        places.append(places[-1] + 0.1 * velocity)
+        if k % 5 == 0:
+            fix_m = places[max(k - round(10.0 * late_s), 0)] + grip.antenna_m
+            grip.score_fix(GnssFix(k * 10**8, fix_m, np.full(3, 0.05)))
+    assert not grip.leads
+
+
 def test_heading_and_place_do_not_matter() -> None:
     here, there = Straight(), Straight(2.3, (-400.0, 1200.0))
     for robot in (here, there):
