@@ -46,8 +46,8 @@ PRIOR_MPS2, PRIOR_SPREAD = 1.0, 0.7
 ROLLING_PRIOR = 0.9
 """Prior probability that the wheels hold: half rolling, half the limits of dry ground (assumed)."""
 LATE_S, LATE = (0.25, 0.5, 1.0, 1.5), 0.2
-"""Delays of the fixes of wheels that hold, and their prior share (assumed): in turns and starts late fixes look
-like a skid."""
+"""Delays of the fixes of wheels that hold, and their prior share (assumed): in turns and starts late fixes
+look like a skid."""
 LEAST_INTERVAL_S, LONGEST_INTERVAL_S = 0.9, 1.6
 """Interval between the fixes that are compared."""
 PATH_SHARE, PATH_SIGMA_M = 0.1, 0.05
