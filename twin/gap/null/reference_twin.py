@@ -52,8 +52,8 @@ DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one 
 STEPS, TRIES, ENOUGH = 6, 4, 0.01
 """Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
 MOST_STEPS = 4
-"""Integration steps a sample beyond which ground is too hard or motors are too stiff to be tried: logs hardly
-tell them from softer ones, and all rollouts would take longer."""
+"""Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not tried:
+logs hardly tell them from softer ones, and all rollouts would take longer."""
 DAMPING, LESS, MORE = 1.0, 1.0 / 6.0, 8.0
 """First damping, as a share of the information, and its factors after a step that is better, or is not."""
 
@@ -93,11 +93,16 @@ class _Fit:
             {c.name: c.value(float(x)) for c, x in zip(self.numbers, w, strict=True)}
         )
 
+    def steps(self, model: Model) -> int:
+        """Integration steps a sample that a twin needs."""
+        return stable_steps(DT_S, plant_of(self.runs[0].log, model), INTEGRATOR_ORDER)
+
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or would need
-        more than `MOST_STEPS`."""
-        models, count, log = [self.model(w) for w in points], len(self.runs), self.runs[0].log
-        soft = [stable_steps(DT_S, plant_of(log, m), INTEGRATOR_ORDER) <= MOST_STEPS for m in models]
+        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or needs too
+        many steps."""
+        models, count = [self.model(w) for w in points], len(self.runs)
+        most = max(MOST_STEPS, self.steps(self.cache.model))
+        soft = [self.steps(model) <= most for model in models]
         tried = [Rollout(r.log, {}, model=m) for m in itertools.compress(models, soft) for r in self.runs]
         found = iter(aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs))
         out = list[list[Array] | None]()
