@@ -52,8 +52,8 @@ DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one 
 STEPS, TRIES, ENOUGH = 6, 4, 0.01
 """Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
 MOST_STEPS = 4
-"""Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not tried:
-logs hardly tell them from softer ones, and all rollouts would take longer."""
+"""Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not
+tried: logs hardly tell them from softer ones, and all rollouts would take longer."""
 DAMPING, LESS, MORE = 1.0, 1.0 / 6.0, 8.0
 """First damping, as a share of the information, and its factors after a step that is better, or is not."""
 
