@@ -234,7 +234,7 @@ def summary(result: ReplayResult) -> list[str]:
 
 def _baseline_lines(baselines: Baselines) -> list[str]:
     """The errors of the baselines, where they are scored."""
-    held = "the receiver alone, its last fix held in gaps,"
+    held = "the receiver alone (its last fix held in gaps)"
     named = (("dead reckoning", baselines.dead_reckoning_m), (held, baselines.gnss_m))
     shown = [f"{name} {error_m:.3f} m" for name, error_m in named if error_m is not None]
     return [f"for comparison, scored alike: {', '.join(shown)}"] if shown else []
