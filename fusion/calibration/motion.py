@@ -98,7 +98,8 @@ def _speed_gained(drive: MotionSegment, begin: int, end: int) -> Array:
     first, last = max(begin - 1, 0), min(end + 1, len(drive.distance_m))
     if last - first < 2:
         return np.zeros(end - begin)
-    speed = drive.distance_m[first:last] / np.diff(drive.t_s[first : last + 1])
+    dt = np.maximum(np.diff(drive.t_s[first : last + 1]), LEAST_STEP_S)
+    speed = drive.distance_m[first:last] / dt
     return np.asarray(np.gradient(speed)[begin - first :][: end - begin])
 
 

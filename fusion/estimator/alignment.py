@@ -1,4 +1,4 @@
-"""The start: attitude from gravity, heading and position from GNSS against dead reckoning."""
+"""The start: attitude from gravity, or a given pose, and the first state of the graph with its prior."""
 
 from __future__ import annotations
 
@@ -7,32 +7,27 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, turned
-from terrafusion.fusion.inputs.validation import MOST_AWAY_M, MOST_HEIGHT_M, GnssFix, as_number, as_numbers
+from terrafusion.fusion.inputs.validation import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
 from terrafusion.fusion.noise.policy import SensorNoise
 
 STILL_MPS = 0.01
 STILL_RADPS = 0.05
 WINDOW_NS = 1_000_000_000
 LEVEL_SIGMA_STILL_RAD, LEVEL_SIGMA_MOVING_RAD = 0.02, 0.05
-LEAST_RATIO = 0.3
-"""Driven over dead-reckoned distance below which the robot is stuck and shows no heading."""
 UNSEEN_BIAS_SIGMA_RADPS = 0.004
 """Least prior of the gyro's bias where the robot did not stand at the start: data sheets and drivers promise
 less than is found (0.0035 rad/s on a Husky whose driver removes it at rest)."""
 LEAST_SIGMA, MOST_YAW_RAD = 1e-6, 100.0
 """Of a given start: sigma in m or rad, and a heading, which more than degrees exceed."""
-SLIP_SIGMA = 0.05
-"""Relative error of wheel speed against GNSS velocity (assumed)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +111,9 @@ def initial_state(
     )
     level = float(np.hypot(start.level_sigma_rad, imu.accel_bias_sigma_mps2 / GRAVITY_MPS2))
     yaw = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
-    sigmas = [level, level, yaw, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
+    # A velocity along a heading that is unknown has an unknown direction, too.
+    speed = float(np.hypot(0.1 + 0.3 * abs(start.speed_mps), yaw * start.speed_mps))
+    sigmas = [level, level, yaw, *[start.position_sigma_m] * 3, *[speed] * 3]
     seen = start.gyro_bias_radps is not None or imu.gyro_bias_sigma_radps == 0.0
     least_bias = 0.0 if seen else UNSEEN_BIAS_SIGMA_RADPS
     gyro_bias_sigma = max(imu.gyro_bias_sigma_radps, least_bias)
@@ -168,95 +165,3 @@ def checked_start(
         )
     sigma_m, sigma_rad = max(position_sigma_m, LEAST_SIGMA), max(min(yaw_sigma_rad, np.pi), LEAST_SIGMA)
     return KnownStart(position, yaw_rad, sigma_m, sigma_rad)
-
-
-def heading_from_motion(
-    imu: ImuStream,
-    wheels: WheelStream,
-    fixes: list[GnssFix],
-    level: Start,
-    antenna_m: Array,
-    ahead_m: float = 0.0,
-) -> Start | None:
-    """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
-
-    Positions and velocities show the same turn, so their sums add up (see `planar_rotation`). None with
-    fewer than three fixes, or while the fixes hardly move though the wheels do. `ahead_m`: of the `Rig`.
-    """
-    times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
-    inside = [f for f in fixes if len(times) and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
-    if len(inside) < 3 or len(times) < 3:
-        return None
-    yaw_at, path_at = _dead_reckon(imu, wheels, level)
-    t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
-    heading = np.exp(1j * yaw_at(t_fix))
-    lever = complex(ahead_m + antenna_m[0], antenna_m[1])
-    z = path_at(t_fix) + lever * heading
-    g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
-    weight = np.array([1.0 / (f.sigma_m[0] * f.sigma_m[1]) for f in inside])
-    turn, information = planar_rotation(z, g, weight)
-    half = 0.1
-    z_dot = (path_at(t_fix + half) - path_at(t_fix - half)) / (2.0 * half)
-    z_dot = z_dot + lever * (np.exp(1j * yaw_at(t_fix + half)) - np.exp(1j * yaw_at(t_fix - half))) / 0.2
-    for fix, v in zip(inside, z_dot.tolist(), strict=True):
-        if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps[:2].sum() + fix.sigma_v_mps):
-            w = 1.0 / (max(fix.sigma_v_mps, 1e-3) ** 2 + (SLIP_SIGMA * abs(v)) ** 2)
-            turn += w * np.conj(v) * complex(fix.velocity_mps[0], fix.velocity_mps[1])
-            information += w * abs(v) ** 2
-    if information <= 0.0 or abs(turn) < LEAST_RATIO * information:
-        return None
-    yaw = float(np.angle(turn))
-    origin = np.average(g, weights=weight) - np.exp(1j * yaw) * np.average(z, weights=weight)
-    off = _excess(g - origin - np.exp(1j * yaw) * z, z, weight)
-    body = origin + ahead_m * np.exp(1j * yaw)
-    heights = np.array([f.enu_m[2] for f in inside])
-    height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
-    return dataclasses.replace(
-        level,
-        position_m=np.array([body.real, body.imag, height]),
-        position_sigma_m=float(5.0 * off / np.sqrt(weight.max())) + 0.05,
-        yaw_rad=yaw,
-        yaw_sigma_rad=off * information**0.5 / abs(turn),
-    )
-
-
-def _excess(left_m: NDArray[np.complex128], z: NDArray[np.complex128], weight: Array) -> float:
-    """Root mean square of what the fixes leave over their sigma and slip, at least 1.
-
-    Sigmas are scaled by it where fixes disagree (Birge ratio; Birge 1932, Phys. Rev. 40, 207).
-    """
-    slip_m = SLIP_SIGMA * np.abs(z - np.average(z, weights=weight))
-    squares = np.abs(left_m) ** 2 / (2.0 * (1.0 / weight + slip_m**2))
-    return max(1.0, float(np.sqrt(squares.sum() / (len(z) - 2))))
-
-
-def _dead_reckon(imu: ImuStream, wheels: WheelStream, level: Start):  # type: ignore[no-untyped-def]
-    """Yaw (rad) and complex horizontal position (m) over seconds from the start, as functions.
-
-    The ground is taken for a plane: the path in it is projected by the attitude of the start.
-    """
-    t, gyro, _ = imu.window(level.t_ns, imu.t_ns[-1] + 1)
-    bias = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0
-    yaw = np.concatenate([[0.0], np.cumsum((gyro[1:, 2] - bias) * np.diff(t))])
-    index = [i for i, x in enumerate(wheels.t_ns) if x >= level.t_ns]
-    t_wheel = np.array([wheels.t_ns[i] - level.t_ns for i in index], dtype=float) * 1e-9
-    distance = np.array([0.5 * (wheels.left_m[i] + wheels.right_m[i]) for i in index])
-    middle = np.interp(0.5 * (t_wheel[1:] + t_wheel[:-1]), t, yaw)
-    steps = np.diff(distance)
-    in_plane = np.stack([steps * np.cos(middle), steps * np.sin(middle)])
-    level_x, level_y = _flattened(level) @ in_plane
-    path = np.concatenate([[0.0 + 0.0j], np.cumsum(level_x + 1j * level_y)])
-
-    def yaw_at(s: Array) -> Array:
-        return np.interp(s, t, yaw)
-
-    def path_at(s: Array) -> NDArray[np.complex128]:
-        return np.interp(s, t_wheel, path.real) + 1j * np.interp(s, t_wheel, path.imag)
-
-    return yaw_at, path_at
-
-
-def _flattened(level: Start) -> Array:
-    """Horizontal part (2, 2) of motion in the plane the robot stands on, axes as at the start."""
-    roll, pitch = level.roll_rad, level.pitch_rad
-    return np.array([[np.cos(pitch), np.sin(pitch) * np.sin(roll)], [0.0, np.cos(roll)]])

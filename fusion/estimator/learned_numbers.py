@@ -108,7 +108,7 @@ class LearnedNumbers:
     def __init__(
         self, config: EstimatorConfig, imu: ImuStream, gnss: GnssUpdater, weights: TerrainNoise
     ) -> None:
-        known, prior = config.rig.known, _prior(config)
+        known, prior = config.rig.known, prior_of(config)
         self.calibration = _calibration(config, prior)
         self._imu, self._gnss, self._weights = imu, gnss, weights
         self.mounting = ImuMounting(config, imu, gnss.skid)
@@ -350,7 +350,7 @@ def _doubt_place(chain: Chain, moved_m: float) -> None:
     chain.restart(doubt)
 
 
-def _prior(config: EstimatorConfig) -> Knowledge:
+def prior_of(config: EstimatorConfig) -> Knowledge:
     """What is known of the robot before it drives."""
     yaw, bias_sigma = config.inputs.yaw, config.rig.sensors.imu.gyro_bias_sigma_radps
     slip_time_s = SLIP_STEADY * config.policy.fixed.slip_time_s

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-
 import numpy as np
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -13,10 +10,11 @@ from terrafusion.fusion.estimator.alignment import (
     WINDOW_NS,
     KnownStart,
     Start,
-    heading_from_motion,
     level_start,
 )
-from terrafusion.fusion.estimator.gnss import GnssUpdater
+from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.estimator.heading_from_motion import MotionDoubt, MotionStart, heading_from_motion
+from terrafusion.fusion.estimator.learned_numbers import prior_of
 from terrafusion.fusion.estimator.plausibility import plausible_fixes
 from terrafusion.fusion.estimator.stationarity import drop_before_start
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
@@ -24,9 +22,12 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
 """Without a fix for so long the start no longer waits for a better heading, where there is one that tells
 forward from sideways (45 deg; assumed)."""
-MANY_FIXES, UNKNOWN_YAW_RAD = 10, math.pi / math.sqrt(3.0)
-"""From so many fixes on the position is known, and any heading will do, with the sigma that it has: at most
-that of one of which nothing is known, uniform over the circle (assumed)."""
+CLEAR_YAW_RAD, CLEARER_NS = 0.3, 10_000_000_000
+"""While an unknown antenna or late fixes leave a heading less clear than this, which the first state allows
+for, a start waits for so long: until the robot stops turning (assumed)."""
+MANY_FIXES = 10
+"""From so many fixes on the position is known, and any heading will do, with the sigma that it has
+(assumed). The graph does not use these fixes again: what they say of such a heading is not linear."""
 
 
 class StartSearch:
@@ -40,9 +41,12 @@ class StartSearch:
     def __init__(self, config: EstimatorConfig, aids: AidingSensors, gnss: GnssUpdater) -> None:
         self.known: KnownStart | None = None
         self.level: Start | None = None
-        self._rough: Start | None = None
+        self._rough: MotionStart | None = None
+        self._unclear_ns: int | None = None
+        self._newest_fix_came_ns = 0
         self._config, self._aids, self._gnss = config, aids, gnss
         self._antenna_m, self._ahead_m = np.array(config.rig.sensors.gnss.antenna_m), config.rig.ahead_m
+        self._doubt = MotionDoubt(prior_of(config).covariance, 1.0 - WHITE_SHARE, gnss.drift_time_s)
 
     def find(self, imu: ImuStream, wheels: WheelStream, last: bool) -> Start | None:
         """The start, or None as long as there is none; `last`: no more samples will come."""
@@ -62,21 +66,32 @@ class StartSearch:
             return self.known.at(self.level)
         fixes = self._gnss.waiting
         if fixes and self._gnss.have_new():
+            self._newest_fix_came_ns = imu.t_ns[-1]
             fitting = plausible_fixes(fixes, wheels)
-            place = self._antenna_m, self._ahead_m
-            start = heading_from_motion(imu, wheels, fitting, self.level, *place)
-            if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
+            place = self._antenna_m, self._ahead_m, self._doubt
+            found = heading_from_motion(imu, wheels, fitting, self.level, *place)
+            if found is not None and self._clear(found, imu.t_ns[-1]):
                 self._gnss.refuse_waiting(fitting)
-                return start
-            self._rough = start
+                return found.start
+            self._rough = found
             if drop_before_start(imu, wheels, fixes):
                 self.level = self._rough = None
-        elif fixes and (last or imu.t_ns[-1] - fixes[-1].t_ns > SILENT_NS):
+        elif fixes and (last or imu.t_ns[-1] - self._newest_fix_came_ns > SILENT_NS):
             rough = self._rough
-            if rough is not None and (len(fixes) >= MANY_FIXES or rough.yaw_sigma_rad <= ROUGH_YAW_RAD):
+            if rough is not None and rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD:
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
-                return dataclasses.replace(rough, yaw_sigma_rad=min(rough.yaw_sigma_rad, UNKNOWN_YAW_RAD))
+                return rough.start
+            if rough is not None and len(fixes) >= MANY_FIXES:
+                self._gnss.waiting.clear()
+                self.known = rough.alone()
+                return self.known.at(self.level)
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
             self._gnss.local = True
             return self.level
         return None
+
+    def _clear(self, found: MotionStart, now_ns: int) -> bool:
+        if found.random_rad > self._config.yaw_sigma_start_rad:
+            return False
+        self._unclear_ns = self._unclear_ns or now_ns
+        return found.start.yaw_sigma_rad <= CLEAR_YAW_RAD or now_ns - self._unclear_ns > CLEARER_NS

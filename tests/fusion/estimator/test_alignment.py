@@ -15,9 +15,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.alignment import Start, heading_from_motion, level_start
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -239,52 +237,3 @@ def test_wheels_that_fall_silent_do_not_hold_up_the_start() -> None:
     for i in range(300):
         estimator.add_imu(i * 10_000_000, np.zeros(3), [0.0, 0.0, 9.81])
     assert states
-
-
-def start_of(scatter_m: float) -> Start:
-    """The start by fixes that claim 2 cm and scatter so much, after 12 s."""
-    recording = drive(seconds=12.0)
-    assert recording.gnss is not None
-    assert recording.wheels is not None
-    off = np.random.default_rng(3).normal(0.0, scatter_m, (len(recording.gnss), 2))
-    estimator = Estimator.for_vehicle("elevate")
-    for message in dataclasses.replace(recording, gnss=None).messages():
-        estimator.add(message)
-    fixes = [
-        GnssFix(int(t), at + np.append(d, 0.0), np.full(3, 0.02))
-        for t, at, d in zip(recording.gnss.t_ns, recording.gnss.enu_m, off, strict=True)
-    ]
-    level = level_start(estimator.imu, estimator.wheels, recording.start_ns + 20_000_000)
-    start = heading_from_motion(estimator.imu, estimator.wheels, fixes, level, np.zeros(3))
-    assert start is not None
-    return start
-
-
-def test_fixes_that_disagree_widen_the_start() -> None:
-    honest, wild = start_of(0.0), start_of(1.0)
-    assert honest.yaw_sigma_rad < 0.05
-    assert wild.yaw_sigma_rad > 10.0 * honest.yaw_sigma_rad
-    assert wild.position_sigma_m > 10.0 * honest.position_sigma_m
-
-
-def test_a_robot_that_steers_starts_where_its_origin_is_and_not_its_rear_axle() -> None:
-    estimator, ahead_m, antenna_m = Estimator.for_vehicle("elevate"), 1.3, np.array([0.4, -0.2, 0.0])
-    speed_mps, yaw_rad, origin = 2.0, 0.7, 10.0 + 5.0j
-    axle, yaw, fixes = origin - ahead_m * np.exp(1j * yaw_rad), yaw_rad, []
-    for i in range(1500):
-        t_ns, rate_radps = i * 10_000_000, 0.3 + 0.2 * np.sin(0.01 * i)
-        if i:
-            yaw += 0.01 * rate_radps
-            axle += 0.01 * speed_mps * np.exp(1j * (yaw - 0.005 * rate_radps))
-        estimator.add_imu(t_ns, [0.0, 0.0, rate_radps], [0.0, speed_mps * rate_radps, 9.81])
-        if i % 5 == 0:
-            estimator.add_wheels(t_ns, speed_mps, speed_mps)
-        if i >= 200 and i % 20 == 0:
-            at = axle + (ahead_m + complex(*antenna_m[:2])) * np.exp(1j * yaw)
-            fixes.append(GnssFix(t_ns, np.array([at.real, at.imag, 0.0]), np.full(3, 0.02)))
-    level = level_start(estimator.imu, estimator.wheels, 0)
-    level = dataclasses.replace(level, roll_rad=0.0, pitch_rad=0.0)
-    start = heading_from_motion(estimator.imu, estimator.wheels, fixes, level, antenna_m, ahead_m)
-    assert start is not None
-    assert start.yaw_rad == pytest.approx(yaw_rad, abs=0.02)
-    assert start.position_m[:2] == pytest.approx([origin.real, origin.imag], abs=0.05)

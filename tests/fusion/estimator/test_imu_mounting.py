@@ -46,7 +46,7 @@ def run() -> Recording:
     )
     route = (RouteLeg("asphalt"),)
     laps = Scenario("laps", 82.0, route=route, drive=(DriveSegment(2.0), *lap, *lap, *lap, *lap))
-    return mounted(simulate(laps, seed=3), ANGLE_RAD)
+    return mounted(simulate(laps, seed=7), ANGLE_RAD)
 
 
 def learned(numbers: tuple[NumberAfterDrive, ...]) -> NumberAfterDrive:
@@ -66,9 +66,11 @@ def test_a_turned_imu_is_found_and_corrected(run: Recording) -> None:
 
 
 def test_the_file_carries_the_angle_on_and_makes_the_drive_good(run: Recording, tmp_path: Path) -> None:
-    found = calibrate_sensors([run], "elevate")
+    found, straight = (calibrate_sensors([r], "elevate") for r in (run, mounted(run, -ANGLE_RAD)))
     assert found.numbers["imu_yaw_rad"].observed
-    assert abs(found.numbers["gnss_delay_s"].value) < 0.05, "not learned with the wrong angle"
+    delay, right = (sensors.numbers["gnss_delay_s"] for sensors in (found, straight))
+    assert delay.value == pytest.approx(right.value, abs=0.005), "not learned with the wrong angle"
+    assert abs(delay.value) < delay.sigma
     file = write_robot(tmp_path / "my_robot.yaml", found)
     robot = load_vehicle(file)
     estimator = Estimator(EstimatorConfig(robot.rig(), robot.name))
