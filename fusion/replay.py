@@ -153,7 +153,7 @@ class _Drive:
             held_out=self.held_out,
             outages=self.outages,
             antenna_m=estimator.gnss.antenna_places,
-            aligned=estimator.gnss.local,
+            aligned=estimator.gnss.unplaced,
         )
 
     def baselines(self, estimate: Estimate, scores: Scores, estimator: Estimator) -> Baselines:
@@ -168,7 +168,7 @@ class _Drive:
             wheel_radius_m=rig.wheel_radius_m,
             track_m=rig.track_m,
             antenna_m=rig.sensors.gnss.antenna_m,
-            aligned=estimator.gnss.local,
+            aligned=estimator.gnss.unplaced,
         )
 
 

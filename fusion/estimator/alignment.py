@@ -111,8 +111,8 @@ def initial_state(
     )
     level = float(np.hypot(start.level_sigma_rad, imu.accel_bias_sigma_mps2 / GRAVITY_MPS2))
     yaw = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
-    # A velocity along a heading that is unknown has an unknown direction, too.
-    speed = float(np.hypot(0.1 + 0.3 * abs(start.speed_mps), yaw * start.speed_mps))
+    # A velocity along an unknown heading has an unknown direction, too: this prior must not tell it.
+    speed = float(np.hypot(0.1 + 0.3 * abs(start.speed_mps), 3.0 * yaw * start.speed_mps))
     sigmas = [level, level, yaw, *[start.position_sigma_m] * 3, *[speed] * 3]
     seen = start.gyro_bias_radps is not None or imu.gyro_bias_sigma_radps == 0.0
     least_bias = 0.0 if seen else UNSEEN_BIAS_SIGMA_RADPS

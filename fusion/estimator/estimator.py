@@ -37,7 +37,7 @@ from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
-from terrafusion.fusion.estimator.place_doubt import PlaceDoubt
+from terrafusion.fusion.estimator.place_doubt import PlaceDoubt, rounded
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
@@ -435,12 +435,12 @@ class Estimator:
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             terrain=self.weights.posterior(),
-            status="running" if aided else ("no_gnss" if self.gnss.local else "outage"),
+            status="running" if aided else ("no_gnss" if self.gnss.unplaced else "outage"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._reported_covariance, gyro, gyro_sigma),
         )
-        self._state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
+        self._state = rounded(self.gnss.plausible.widened(state, self.gnss.track.reach_m))
         if not self._silent:
             call_back(self._on_state, self._state)
         return self._state

@@ -17,14 +17,14 @@ from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE, DriftWatch
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
+from terrafusion.fusion.estimator.fix_velocity import FixVelocities
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
-from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, NAV, POSE, SLIP, VELOCITY, cross
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
+from terrafusion.fusion.graph.key_state import BIAS, DRIFT, NAV, POSE, SLIP, VELOCITY
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
@@ -35,8 +35,6 @@ KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 UNKNOWN_HEIGHT_SIGMA_M = 1e6
 """1 sigma of an unknown height: even many such fixes must not determine it."""
-UNKNOWN_CLIMB_MPS = 100.0
-"""1 sigma of the upward velocity of a receiver that reports speed and course alone."""
 OUTAGE_S = 2.0
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
@@ -53,8 +51,6 @@ OPTIMISM = 3.0
 reports even less has fixes of a better class (RTK), which drift in proportion to their sigma."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """Heading sigma after the heading was corrected from the motion (assumed)."""
-VELOCITY_OFF_MPS, VELOCITY_OFF_SIGMA = 2.0, 6.0
-"""A velocity farther from the estimate's, beyond so many sigmas, is none of the robot (assumed)."""
 VELOCITY_SIGMA_MPS = 0.3
 """Velocity sigma after the fixes used turned out to be far less accurate than reported (assumed)."""
 
@@ -65,9 +61,10 @@ class GnssUpdater:
 
     Attributes:
         waiting: fixes not yet used, oldest first.
-        local: the graph was started without GNSS and is not yet aligned with the map.
+        local: the graph was started without GNSS, or without a heading (`placed`: at a known place), and is
+            not yet aligned with the map.
         alignment: with the map, once known; unaligned: how many fixes came until then.
-        velocities_refused: how many velocities were too far from the estimate's.
+        velocities: their velocities.
         rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
         turned: how often the heading was corrected from the motion.
         scale: scatter of the fixes over their reported sigma, 1 where it is below `OPTIMISTIC_SCATTER`.
@@ -105,8 +102,9 @@ class GnssUpdater:
         # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
-        self.local = False
+        self.local = self.placed = False
         self.alignment: MapAlignment | None = None
+        self._local_fixes: list[GnssFix] = []
         self.unaligned = 0
         self.rejected = 0
         self.too_late = 0
@@ -114,7 +112,7 @@ class GnssUpdater:
         self._newest_ns = 0
         self._unchecked: GnssFix | None = None
         self._pair: FixPair | None = None
-        self.velocities_refused = 0
+        self.velocities = FixVelocities()
         self.plausible = FixPlausibility()
         self._report = report
         self._seen = 0
@@ -165,6 +163,11 @@ class GnssUpdater:
         used_ns = self.last_used_ns
         return used_ns is None or (t_ns - used_ns) * 1e-9 > OUTAGE_S + max(self.delay_s, 0.0)
 
+    @property
+    def unplaced(self) -> bool:
+        """Whether the path is local from its first position on."""
+        return self.local and not self.placed
+
     def update(self, chain: Chain, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
@@ -182,7 +185,8 @@ class GnssUpdater:
             elif self.local:
                 self.unaligned += 1
                 self.track.add(fix)
-                used |= self._align(chain, fix)
+                self._local_fixes += [fix] if chain.archive is not None else []
+                used |= self._align(chain, fix, noise)
             elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:
@@ -239,13 +243,28 @@ class GnssUpdater:
             return GateDecision.REACQUIRE, nis
         return (verdict if self._pair.usable else GateDecision.REJECT), nis
 
-    def _align(self, chain: Chain, fix: GnssFix) -> bool:
+    def _align(self, chain: Chain, fix: GnssFix, noise: SensorNoise) -> bool:
         """Align a path that was begun without fixes with the map; True once they determine how."""
         self.alignment = align_to_map(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
         if self.alignment is None:
             return False
         self.local, self.last_used_ns = False, fix.t_ns
+        if chain.archive is not None:
+            self._add_local_fixes(chain.archive, noise.gnss_inflation * self.scale)
         return True
+
+    def _add_local_fixes(self, archive: Chain, inflation: float) -> None:
+        """Fixes that came before the path lay on the map, for the batch solution."""
+        for fix in self._local_fixes:
+            k = keyframe_of(fix, archive)
+            if k is None:
+                continue
+            at, share = AntennaMotion.of(archive, k, fix, self.antenna_m), self._drift_share(fix, inflation)
+            sigma, enu_m = self._white_sigma(fix, inflation, share), fix.enu_m
+            if not math.isfinite(enu_m[2] + sigma[2]):
+                height = (np.asarray(archive.state(k).pose.translation()) + at.R @ at.lever_m)[2]
+                sigma, enu_m = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M), np.append(enu_m[:2], height)
+            archive.add_fix(k, GnssPosition(enu_m, at.lever_m, sigma, share, at.velocity_mps))
 
     def _update_scale(self, scatter: float, white: float) -> None:
         """Scatter of the fixes about the path, and its white share, over the reported sigma."""
@@ -385,42 +404,15 @@ class GnssUpdater:
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, position if weight == 1.0 else dataclasses.replace(position, weight=weight))
-        self._add_velocity(chain, k, fix, at, covariance, noise)
+        velocity = self.velocities.factor(chain, fix, at, self.antenna_m, covariance, noise.gnss_inflation)
+        if velocity is not None:
+            chain.add_velocity(k, velocity)
         if cut:
             chain.smooth(chain.last - k + 1)
             chain.restart(np.zeros(chain.dim), k)
         if weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
-
-    def _add_velocity(
-        self, chain: Chain, k: int, fix: GnssFix, at: AntennaMotion, covariance: Array, noise: SensorNoise
-    ) -> None:
-        """The velocity of a fix as a factor of keyframe k, where the fix has a usable one."""
-        measured_mps = self._usable_velocity(fix, at.velocity_mps, covariance)
-        if measured_mps is None:
-            return
-        measured = np.isfinite(measured_mps)
-        sigma = np.where(measured, max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), UNKNOWN_CLIMB_MPS)
-        at_keyframe = np.where(measured, measured_mps, at.velocity_mps) - at.accel_mps2 * at.offset_s
-        if chain.dim > GNSS_DELAY:
-            doubt = float(np.linalg.norm(at.accel_mps2) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
-            sigma, turned = np.hypot(sigma, doubt), lever_arm_velocity(at.rate_radps, at.offset_s)
-            chain.add_velocity(k, GnssVelocity(at_keyframe, sigma, self.antenna_m, turned))
-        else:
-            lever_mps = at.R @ cross(at.rate_radps, at.antenna_m)
-            chain.add_velocity(k, GnssVelocity(at_keyframe - lever_mps, sigma))
-
-    def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
-        """The velocity (3,) of a fix, NaN where not measured; None where there is none that a robot has."""
-        velocity = fix.velocity_mps
-        if velocity is None or not math.isfinite(float(velocity[0] + velocity[1]) + fix.sigma_v_mps):
-            return None
-        sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
-        off_mps = math.sqrt(sum([v * v for v in (velocity - predicted_mps).tolist() if v == v]))
-        usable = off_mps <= VELOCITY_OFF_MPS + VELOCITY_OFF_SIGMA * sigma_mps
-        self.velocities_refused += not usable
-        return velocity if usable else None
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""

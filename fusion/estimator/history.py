@@ -38,9 +38,18 @@ class History:
         self.changes.extend(changes)
 
     def align(self, alignment: MapAlignment | None, batch: bool) -> tuple[str, ...]:
-        """Move the local states before the first fixes onto the map; gives a note where there are any."""
-        local = [i for i, state in enumerate(self.states) if state.status == "no_gnss"]
-        if alignment is None or not local:
+        """Move the local states before the first fixes onto the map; gives a note where there are any.
+
+        Live, states of a known place and an unknown heading stay as they were given out.
+        """
+        if alignment is None:
+            return ()
+        local = [
+            i
+            for i, state in enumerate(self.states)
+            if state.status == "no_gnss" or (batch and state.t_ns < alignment.t_ns)
+        ]
+        if not local:
             return ()
         for i in local:
             self.states[i] = alignment.moved(self.states[i])

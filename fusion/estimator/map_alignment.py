@@ -33,8 +33,8 @@ OPEN_YAW_RAD, OPEN_M = np.pi, 1e4
 
 @dataclass(frozen=True, eq=False)
 class MapAlignment:
-    """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU,
-    since `t_ns`.
+    """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU, from
+    the keyframe at `t_ns` on.
     """
 
     t_ns: int
@@ -83,7 +83,7 @@ def align_to_map(
     doubt[5] = float(fix.sigma_m[2]) ** 2 if known else 0.0
     doubt[DRIFT] = drift_sigma_m**2
     opened = PLACE if known else PLACE[:3]  # fixes without height leave that of the start as it is
-    alignment = MapAlignment(fix.t_ns, track.error_of(fit), antenna, to_m)
+    alignment = MapAlignment(chain.nodes[-1].t_ns, track.error_of(fit), antenna, to_m)
     drop_local_factors(chain.nodes)
     chain.restart(doubt, chain.first, opened)
     chain.turn(alignment.yaw_rad, alignment.from_m, alignment.to_m)

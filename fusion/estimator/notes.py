@@ -12,7 +12,10 @@ from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
-    if gnss.local and not gnss.unaligned:
+    if gnss.placed:
+        then = "later fixes showed it" if gnss.alignment is not None else "no later fixes showed it"
+        notes.append(f"the first fixes ended before they showed the heading: it was unknown at first; {then}")
+    elif gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     elif gnss.local:
         notes.append(
@@ -25,8 +28,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     if gnss.turned:
         notes.append(f"the heading was wrong and was set right from the motion {times(gnss.turned)}")
     notes += gnss.plausible.notes()
-    if gnss.velocities_refused:
-        notes.append(f"{gnss.velocities_refused} GNSS velocities were far from what wheels and IMU allow")
+    if gnss.velocities.refused:
+        notes.append(f"{gnss.velocities.refused} GNSS velocities were far from what wheels and IMU allow")
     if gnss.skid.refutations:
         notes.append(f"fixes showed {times(gnss.skid.refutations)} that the wheels skidded")
     friction = gnss.skid.friction

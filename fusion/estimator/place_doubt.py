@@ -8,13 +8,17 @@ Schmidt 1966, Adv. Control Systems 3). Without fixes the place moves on with the
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.graph.key_state import POSE, KeyState
 
+LINEAR_YAW_RAD = 0.8
+"""1 sigma of the heading up to which an ellipse holds where the robot may be (assumed)."""
 HEADING_TIME_S = 60.0
 """Longest time over which fixes and gyro hold the heading together (assumed)."""
 
@@ -62,6 +66,20 @@ class PlaceDoubt:
         out = P.copy()
         out[POSE, POSE] += (J * moments) @ J.T
         return out
+
+
+def rounded(state: State) -> State:
+    """A state whose covariance is a circle where the heading is all but unknown.
+
+    A path of unknown direction ends on an arc; the ellipse of its linear part is far too thin. A circle of
+    the same trace holds the arc's second moments for any sigma of the heading beyond `LINEAR_YAW_RAD`.
+    """
+    if state.covariance[5, 5] <= LINEAR_YAW_RAD**2:
+        return state
+    covariance = state.covariance.copy()
+    covariance[:2], covariance[:, :2] = 0.0, 0.0
+    np.fill_diagonal(covariance[:2, :2], 0.5 * float(state.covariance[0, 0] + state.covariance[1, 1]))
+    return dataclasses.replace(state, covariance=covariance)
 
 
 def widened_smoothed(

@@ -27,7 +27,8 @@ CLEAR_YAW_RAD, CLEARER_NS = 0.3, 10_000_000_000
 for, a start waits for so long: until the robot stops turning (assumed)."""
 MANY_FIXES = 10
 """From so many fixes on the position is known, and any heading will do, with the sigma that it has
-(assumed). The graph does not use these fixes again: what they say of such a heading is not linear."""
+(assumed). Such a path is local, as it is without fixes, until they lay it onto the map: what they say of an
+unknown heading is not linear."""
 
 
 class StartSearch:
@@ -82,7 +83,7 @@ class StartSearch:
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
                 return rough.start
             if rough is not None and len(fixes) >= MANY_FIXES:
-                self._gnss.waiting.clear()
+                self._gnss.local = self._gnss.placed = True
                 self.known = rough.alone()
                 return self.known.at(self.level)
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):

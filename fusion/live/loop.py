@@ -85,7 +85,7 @@ def live_estimator(
 def verdict_of(estimator: Estimator, history: History, recording: Recording) -> Verdict:
     """The verdict on a finished run that got all fixes, against the truth where the recording has one."""
     history.align(estimator.gnss.alignment, batch=False)
-    rig, local = estimator.config.rig, estimator.gnss.local
+    rig, local = estimator.config.rig, estimator.gnss.unplaced
     antenna_m = rig.sensors.gnss.antenna_m
     estimate = history.estimate(estimator.weights.detector.classes, [], ())
     scores = score(estimate, recording, antenna_m=estimator.gnss.antenna_places, aligned=local)

@@ -190,7 +190,7 @@ def test_a_velocity_that_no_robot_has_is_left_out() -> None:
     fast = dataclasses.replace(gnss, velocity_enu_mps=velocity)
     result = run(dataclasses.replace(drive(), gnss=fast))
     assert result.error_m.max() < 0.5
-    assert result.estimator.gnss.velocities_refused in (20, 21)
+    assert result.estimator.gnss.velocities.refused in (20, 21)
 
 
 @pytest.mark.parametrize("rate", [0.54, None])

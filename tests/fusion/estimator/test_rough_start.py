@@ -61,3 +61,37 @@ def test_many_fixes_start_with_an_unknown_heading_where_they_show_none() -> None
 def test_without_any_hint_of_the_heading_there_is_no_start() -> None:
     with pytest.raises(DataError, match="never moved far enough"):
         replay(with_few_fixes(4.0, 0), mode="fixed")
+
+
+def departing() -> Recording:
+    """A robot that hardly moves for 20 s, then drives away on a curve; no fixes from 20 to 35 s."""
+    drive = (DriveSegment(20.0, v_mps=0.02), DriveSegment(40.0, v_mps=0.8, yaw_rate_radps=0.05))
+    away = Scenario("departing", 60.0, drive=drive, route=(RouteLeg("asphalt"),), heading_deg=50.0)
+    run = simulate(away, seed=1, vehicle="husky")
+    assert run.gnss is not None
+    assert run.truth is not None
+    t_s = (run.gnss.t_ns - run.start_ns) * 1e-9
+    gnss = run.gnss.select((t_s < 20.0) | (t_s > 35.0))
+    there = np.stack([np.interp(gnss.t_ns, run.truth.t_ns, x) for x in run.truth.position_m.T], axis=1)
+    off = np.random.default_rng(2).normal(0.0, 0.3, there.shape) + np.array([0.8, -0.5, 0.0])
+    sigma = np.full(there.shape, SIGMA_M)
+    gnss = dataclasses.replace(
+        gnss, enu_m=there + off, sigma_enu_m=sigma, velocity_enu_mps=None, sigma_v_mps=None
+    )
+    return dataclasses.replace(run, gnss=gnss)
+
+
+@pytest.mark.parametrize("batch", [False, True], ids=["live", "batch"])
+def test_fixes_that_come_back_show_a_heading_that_was_unknown(batch: bool) -> None:
+    """Until then sigma spans where the robot may be; and its first fixes are not refused."""
+    run = departing()
+    found = replay(run, mode="fixed", batch=batch)
+    path, errors = found.estimate.trajectory, found.scores.errors
+    assert errors is not None
+    assert path.covariance is not None
+    assert any("it was unknown at first; later fixes showed it" in note for note in found.estimate.notes)
+    assert float(np.nanmax(2.0 * errors.nees())) < 9.21
+    unaided = (path.t_ns - run.start_ns) * 1e-9 < 34.0
+    yaw_sigma = np.sqrt(path.covariance[unaided, 5, 5])
+    assert (yaw_sigma < 0.2).all() if batch else (yaw_sigma > 0.6).all()
+    assert errors.distance_m()[errors.t_ns > run.start_ns + 45_000_000_000].max() < 2.0
