@@ -61,8 +61,8 @@ class GnssUpdater:
 
     Attributes:
         waiting: fixes not yet used, oldest first.
-        local: the graph was started without GNSS, or without a heading (`placed`: at a known place), and is
-            not yet aligned with the map.
+        local: the graph was started without GNSS, or without a clear heading at a known place, and is not yet
+            aligned with the map. `placed_ns`: newest fix that gave that place, or -1; it takes later ones.
         alignment: with the map, once known; unaligned: how many fixes came until then.
         velocities: their velocities.
         rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
@@ -102,7 +102,7 @@ class GnssUpdater:
         # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
-        self.local = self.placed = False
+        self.local, self.placed_ns = False, -1
         self.alignment: MapAlignment | None = None
         self._local_fixes: list[GnssFix] = []
         self.unaligned = 0
@@ -166,7 +166,11 @@ class GnssUpdater:
     @property
     def unplaced(self) -> bool:
         """Whether the path is local from its first position on."""
-        return self.local and not self.placed
+        return self.local and self.placed_ns < 0
+
+    def place(self) -> None:
+        """Begin a local path at the place that the waiting fixes gave, without a clear heading."""
+        self.local, self.placed_ns = True, self.waiting[-1].t_ns
 
     def update(self, chain: Chain, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
@@ -186,7 +190,7 @@ class GnssUpdater:
                 self.unaligned += 1
                 self.track.add(fix)
                 self._local_fixes += [fix] if chain.archive is not None else []
-                used |= self._align(chain, fix, noise)
+                used |= fix.t_ns > self.placed_ns and self._align(chain, fix, noise)
             elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:

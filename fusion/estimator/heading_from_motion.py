@@ -30,6 +30,10 @@ UNKNOWN_YAW_RAD = np.pi / np.sqrt(3.0)
 """1 sigma of a heading of which nothing is known: uniform over the circle."""
 SLIP_SIGMA = 0.05
 """Relative error of wheel speed against GNSS velocity (assumed)."""
+HALF_S = 0.1
+"""Half of the time over which a speed is taken."""
+DELAYS = (-1.0, 1.0, 2.0)
+"""Delays of the fixes that are tried, in sigmas."""
 LEAST_APART_S = 1e-3
 """Fixes are at least so far apart in time: of two with the same stamp the correlation has no inverse."""
 
@@ -64,6 +68,10 @@ class MotionStart:
     start: Start
     random_rad: float
     place_sigma_m: float
+
+    def fixes_decide(self) -> bool:
+        """Whether the noise of the fixes is most of the heading's variance."""
+        return 2.0 * self.random_rad**2 >= self.start.yaw_sigma_rad**2
 
     def alone(self) -> KnownStart:
         """The start for a graph that does not use these fixes."""
@@ -102,7 +110,8 @@ def heading_from_motion(
         return None
     t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
     lever = complex(ahead_m + antenna_m[0], antenna_m[1])
-    z, z_dot, z_by = _antenna_path(imu, wheels, level, lever, t_fix)
+    path = _antenna_path(imu, wheels, level, lever)
+    z, z_dot = path.at(t_fix), (path.at(t_fix + HALF_S) - path.at(t_fix - HALF_S)) / (2.0 * HALF_S)
     g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
     sigma_m = np.array([np.sqrt(f.sigma_m[0] * f.sigma_m[1]) for f in inside])
     mean_of, mean_variance, pull = _weights(z, t_fix, sigma_m, doubt)
@@ -123,11 +132,12 @@ def heading_from_motion(
     body = origin + ahead_m * np.exp(1j * yaw)
     heights = np.array([f.enu_m[2] for f in inside])
     height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
-    by_numbers = (pull @ z_by).imag / abs(turn)
+    by_numbers = (pull @ path.by_numbers(t_fix)).imag / abs(turn)
+    by_delay = _turned_by_delay(path, pull, t_fix, float(np.sqrt(doubt.numbers[GNSS_DELAY, GNSS_DELAY])))
     stuck = abs(turn) < LEAST_RATIO * information
     # Fixes that move further than the wheels do not show the heading better.
     random = UNKNOWN_YAW_RAD if stuck else off * variance**0.5 / min(abs(turn), information)
-    sigma_rad = float(np.sqrt(random**2 + by_numbers @ doubt.numbers @ by_numbers))
+    sigma_rad = float(np.sqrt(random**2 + by_delay**2 + by_numbers @ doubt.numbers @ by_numbers))
     sigma_rad = min(sigma_rad, UNKNOWN_YAW_RAD)
     mean_m = off * np.sqrt(max(mean_variance, float(((mean_of * sigma_m) ** 2).sum())))
     start = dataclasses.replace(
@@ -180,11 +190,40 @@ def _excess(left_m: Complex, from_mean: Complex, sigma_m: Array) -> float:
     return max(1.0, float(np.sqrt(squares.sum() / (len(left_m) - 2))))
 
 
-def _antenna_path(
-    imu: ImuStream, wheels: WheelStream, level: Start, lever: complex, at_s: Array
-) -> tuple[Complex, Complex, Complex]:
-    """Dead-reckoned place of the antenna (F,) at times from the start, its velocity (F,), and the derivatives
-    (F, 8) of the place by `NUMBERS`; yaw 0 at the start.
+def _turned_by_delay(path: AntennaPath, pull: Complex, t_s: Array, sigma_s: float) -> float:
+    """1 sigma of the turn that fixes show if their delay is `sigma_s`: the most that any of `DELAYS` turns
+    them by a sigma, since a robot that turns on the spot shows another heading a second later.
+    """
+    shown = [complex(pull @ path.at(t_s - k * sigma_s)) for k in (0.0, *DELAYS)]
+    turns = np.angle(np.array(shown[1:]) * np.conj(shown[0]))
+    return float(np.max(np.abs(turns) / np.abs(DELAYS)))
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaPath:
+    """Dead-reckoned path of the antenna, yaw 0 at the start.
+
+    Attributes:
+        t_s: (N,) from the start.
+        place: (N,) m.
+        by: (N, 8) derivatives by `NUMBERS`, but for the delay of the fixes.
+    """
+
+    t_s: Array
+    place: Complex
+    by: Complex
+
+    def at(self, t_s: Array) -> Complex:
+        """Places at times (F,)."""
+        return np.asarray(np.interp(t_s, self.t_s, self.place))
+
+    def by_numbers(self, t_s: Array) -> Complex:
+        """Derivatives (F, 8) at times (F,)."""
+        return np.stack([np.interp(t_s, self.t_s, column) for column in self.by.T], axis=1)
+
+
+def _antenna_path(imu: ImuStream, wheels: WheelStream, level: Start, lever: complex) -> AntennaPath:
+    """The path since the start.
 
     The ground is taken for a plane: the path in it is projected by the attitude of the start.
     """
@@ -198,20 +237,12 @@ def _antenna_path(
     numbers = np.zeros(len(NUMBERS))
     numbers[GYRO_BIAS] = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0
     path = dead_reckoned(drive, numbers)
-    heading, way = np.exp(1j * path.yaw_rad), _flattened(path.z, level)
-    place, by = way + lever * heading, path.z_by + (1j * lever * heading)[:, None] * path.yaw_by
+    heading = np.exp(1j * path.yaw_rad)
+    by = path.z_by + (1j * lever * heading)[:, None] * path.yaw_by
     by[:, ANTENNA_X], by[:, ANTENNA_Y] = heading, 1j * heading
     if level.gyro_bias_radps is not None:
         by[:, GYRO_BIAS] = 0.0
-    half = 0.1
-    velocity = (_at(at_s + half, t_s, place) - _at(at_s - half, t_s, place)) / (2.0 * half)
-    z_by = np.stack([_at(at_s, t_s, column) for column in by.T], axis=1)
-    z_by[:, GNSS_DELAY] = -velocity
-    return _at(at_s, t_s, place), velocity, z_by
-
-
-def _at(at_s: Array, t_s: Array, value: Complex) -> Complex:
-    return np.asarray(np.interp(at_s, t_s, value))
+    return AntennaPath(t_s, _flattened(path.z, level) + lever * heading, by)
 
 
 def _flattened(path: Complex, level: Start) -> Complex:

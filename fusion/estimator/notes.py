@@ -12,9 +12,11 @@ from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
-    if gnss.placed:
+    if gnss.placed_ns >= 0:
         then = "later fixes showed it" if gnss.alignment is not None else "no later fixes showed it"
-        notes.append(f"the first fixes ended before they showed the heading: it was unknown at first; {then}")
+        notes.append(
+            f"the first fixes ended before they showed the heading clearly: it was open at first; {then}"
+        )
     elif gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     elif gnss.local:

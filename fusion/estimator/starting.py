@@ -27,8 +27,8 @@ CLEAR_YAW_RAD, CLEARER_NS = 0.3, 10_000_000_000
 for, a start waits for so long: until the robot stops turning (assumed)."""
 MANY_FIXES = 10
 """From so many fixes on the position is known, and any heading will do, with the sigma that it has
-(assumed). Such a path is local, as it is without fixes, until they lay it onto the map: what they say of an
-unknown heading is not linear."""
+(assumed). Such a path, and one whose heading an antenna or a delay leaves open, is local, as it is without
+fixes, until they lay it onto the map: the graph would make too much of the few fixes there are."""
 
 
 class StartSearch:
@@ -79,11 +79,13 @@ class StartSearch:
                 self.level = self._rough = None
         elif fixes and (last or imu.t_ns[-1] - self._newest_fix_came_ns > SILENT_NS):
             rough = self._rough
-            if rough is not None and rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD:
+            if rough is None:
+                return None
+            if rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD and rough.fixes_decide():
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
                 return rough.start
-            if rough is not None and len(fixes) >= MANY_FIXES:
-                self._gnss.local = self._gnss.placed = True
+            if rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD or len(fixes) >= MANY_FIXES:
+                self._gnss.place()
                 self.known = rough.alone()
                 return self.known.at(self.level)
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):

@@ -139,6 +139,7 @@ def test_unknown_antenna_and_delay_widen_the_heading_of_a_turn_alone(
     systematic = np.sqrt(max(found.start.yaw_sigma_rad**2 - found.random_rad**2, 0.0))
     assert systematic == pytest.approx(abs(turned.yaw_rad - YAW_RAD), rel=0.15, abs=2e-3)
     assert (systematic > 0.05) == (turning_radps > 0.0)
+    assert found.fixes_decide() == (turning_radps == 0.0)
 
 
 def test_weights_are_those_of_the_inverse_covariance() -> None:

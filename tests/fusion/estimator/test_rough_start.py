@@ -89,7 +89,7 @@ def test_fixes_that_come_back_show_a_heading_that_was_unknown(batch: bool) -> No
     path, errors = found.estimate.trajectory, found.scores.errors
     assert errors is not None
     assert path.covariance is not None
-    assert any("it was unknown at first; later fixes showed it" in note for note in found.estimate.notes)
+    assert any("it was open at first; later fixes showed it" in note for note in found.estimate.notes)
     assert float(np.nanmax(2.0 * errors.nees())) < 9.21
     unaided = (path.t_ns - run.start_ns) * 1e-9 < 34.0
     yaw_sigma = np.sqrt(path.covariance[unaided, 5, 5])
