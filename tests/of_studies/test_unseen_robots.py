@@ -12,6 +12,8 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
 from tests.studies.unseen_robots.draw import DRIVES, KINDS, Robot, draw
 from tests.studies.unseen_robots.machine import LOOP_S, STANDING_S, Driven, drive
 from tests.studies.unseen_robots.sensors import recording_of
+from tests.studies.unseen_robots.starts import Start, part
+from tests.studies.unseen_robots.starts import table as start_table
 from tests.studies.unseen_robots.study import (
     EKF,
     MODES,
@@ -112,3 +114,21 @@ def test_learned_numbers_are_held_against_the_truth() -> None:
     assert numbers_table(numbers) == [
         "imu_yaw_rad: within 2 sigma 1 of 2, sigma 0.01 (median), worst 14.2 sigma"
     ]
+
+
+def test_starts_are_tabled_by_receiver() -> None:
+    rows = [Start("rtk", 8.0, 2.0, 1.0, 0.9, 0.0), Start("dgps", 8.0, 1.0, 4.0, 0.5, 0.3)]
+    lines = start_table(rows)
+    assert lines[0].startswith("rtk, outage 8 s after the start (1): error 1.00 m, worst 1.0, over EKF 0.50;")
+    assert lines[-1].startswith("all, outage 8 s after the start (2): error 2.50 m, worst 4.0")
+    assert lines[-1].endswith("inside 95 % ellipses 70 %, outside those of 99 % 15 %")
+
+
+def test_a_part_of_a_log_begins_later() -> None:
+    robot = plain("differential", duration_s=8.0)
+    whole = recording_of(robot, drive(robot))
+    cut = part(whole, 3.0, 4.0)
+    assert cut.start_ns == whole.start_ns + 3_000_000_000
+    assert cut.wheels is not None
+    assert (np.diff(cut.wheels.t_ns) > 0).all()
+    assert cut.duration_s() <= 4.0

@@ -142,6 +142,20 @@ ESTIMATOR = (
         spread=True,
     ),
     Study(
+        "unseen_starts",
+        "Does an outage soon after the start end where sigma says, on robots that no part of the library made?",
+        module("unseen_robots.starts", "--out", OUT),
+        10,
+        {
+            f"{name}_{warm_s}_s": rf"all, outage {warm_s} s .*{pattern}"
+            for warm_s in (8, 20)
+            for name, pattern in (
+                ("over_ekf", r"over EKF ([\d.]+ \[[\d.]+, [\d.]+\])"),
+                ("inside", r"95 % ellipses (\d+ %)"),
+            )
+        },
+    ),
+    Study(
         "unseen_slick",
         "What do adaptive weights gain on slick ground, on robots that no part of the library made?",
         module("unseen_robots.study", "--out", OUT, "--slick", "--seconds", "30"),
