@@ -143,7 +143,7 @@ ESTIMATOR = (
     ),
     Study(
         "unseen_starts",
-        "Does an outage soon after the start end where sigma says, on robots that no part of the library made?",
+        "Do errors soon after the start keep to sigma, on robots that no part of the library made?",
         module("unseen_robots.starts", "--out", OUT),
         10,
         {
