@@ -183,32 +183,41 @@ UP_FACTOR = 2.0
 def with_assumed_sigma(
     rig: Rig | None, sigma: Array, fix: NDArray[np.uint8], every: NDArray[np.uint8] | None = None
 ) -> tuple[Array, list[str]]:
-    """Sigmas (N, 3) with the unknown and the non-positive ones filled, and a note where any was.
-
-    The vehicle's sigma is that of the best class of fix in the log; a poorer one has at least the sigma
-    `ASSUMED_SIGMA_M` of its class.
-
-    Args:
-        fix: (N,) classes.
-        every: classes of all fixes of the log, where `fix` are some of them.
+    """Sigmas (N, 3) with the unknown and the non-positive ones filled (`assumed_sigma`), and a note where
+    any was.
     """
     unknown = ~(sigma > 0.0)
     if not unknown[:, :2].any():
         sigma = np.where(unknown, np.nan, sigma)
         return sigma, []
     filled = int(unknown[:, :2].any(axis=1).sum())
-    spec, flat = rig.sensors.gnss if rig else None, CLASS_SIGMA_M[fix]
-    if spec is not None:
-        poorer = flat > CLASS_SIGMA_M[fix if every is None else every].min()
-        own = np.broadcast_to([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m], sigma.shape)
-        assumed = np.where(poorer[:, None], np.maximum(_by_class(flat), own), own)
-        origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"
-        if poorer.any():
-            origin += f", and by class: {_classes(fix[poorer])}"
-    else:
-        assumed = _by_class(flat)
-        origin = f"assumed by class, flat: {_classes(fix)}"
+    assumed, origin = assumed_sigma(rig, fix, every)
     return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes have no sigma; taken from {origin}"]
+
+
+def assumed_sigma(
+    rig: Rig | None, fix: NDArray[np.uint8], every: NDArray[np.uint8] | None = None
+) -> tuple[Array, str]:
+    """Sigmas (N, 3) of fixes that report none, and where they are from.
+
+    The vehicle's sigma is that of the best class of fix in the log; a poorer one has at least the sigma
+    `ASSUMED_SIGMA_M` of its class. A receiver coarser than the best class did not make these fixes: then all
+    have the sigma of their class.
+
+    Args:
+        fix: (N,) classes.
+        every: classes of all fixes of the log, where `fix` are some of them.
+    """
+    spec, flat = rig.sensors.gnss if rig else None, CLASS_SIGMA_M[fix]
+    best = CLASS_SIGMA_M[fix if every is None else every].min()
+    if spec is None or spec.sigma_horizontal_m > best:
+        return _by_class(flat), f"assumed by class, flat: {_classes(fix)}"
+    poorer = flat > best
+    own = np.array([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m])
+    origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"
+    if poorer.any():
+        origin += f", and by class: {_classes(fix[poorer])}"
+    return np.where(poorer[:, None], np.maximum(_by_class(flat), own), own), origin
 
 
 def _by_class(flat: Array) -> Array:

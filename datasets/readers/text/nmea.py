@@ -22,7 +22,7 @@ from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import CLASS_SIGMA_M, UP_FACTOR
+from terrafusion.datasets.core.sensors import assumed_sigma
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_recording
@@ -343,13 +343,10 @@ def _fixes(request: Request, epochs: list[Epoch], t_ns: TimesNs) -> tuple[Fixes,
     notes = []
     fix, hdop = _column(epochs, "fix").astype(np.uint8), _column(epochs, "hdop")
     sigma = _column(epochs, "sigma_enu_m")
-    spec = request.rig.sensors.gnss if request.rig else None
-    at_one = np.full(len(Fix), spec.sigma_horizontal_m) if spec else CLASS_SIGMA_M
     counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (hdop < UNKNOWN_HDOP)
     if counted.any():
-        flat = (hdop * at_one[fix])[counted]
-        sigma[counted] = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
-        used = ", ".join(f"{Fix(k).name.lower()} {at_one[k]:g} m" for k in np.unique(fix[counted]))
-        notes.append(f"gnss: {int(counted.sum())} fixes without GST: sigma is HDOP times an assumed {used}")
+        at_one, origin = assumed_sigma(request.rig, fix[counted], fix[fix > Fix.NONE])
+        sigma[counted] = hdop[counted, None] * at_one
+        notes.append(f"gnss: {int(counted.sum())} fixes without GST: sigma is HDOP times that of {origin}")
     velocity = _column(epochs, "velocity_enu_mps")
     return Fixes(t_ns, _column(epochs, "llh"), fix, sigma, velocity), notes

@@ -10,11 +10,13 @@ from terrafusion.datasets.core.sensors import with_assumed_sigma
 from terrafusion.twin.model.vehicle import load_vehicle
 
 
-def horizontal_m(classes: list[Fix], every: list[Fix] | None = None) -> tuple[list[float], str]:
-    """Horizontal sigmas without any reported, by a vehicle whose receiver has 0.02 m; and the note."""
+def horizontal_m(
+    classes: list[Fix], every: list[Fix] | None = None, vehicle: str = "elevate"
+) -> tuple[list[float], str]:
+    """Horizontal sigmas without any reported, and the note; the receiver of 'elevate' has 0.02 m."""
     fix = np.array(classes, dtype=np.uint8)
     of_log = None if every is None else np.array(every, dtype=np.uint8)
-    rig = load_vehicle("elevate").rig()
+    rig = load_vehicle(vehicle).rig()
     sigma, notes = with_assumed_sigma(rig, np.full((len(fix), 3), np.nan), fix, of_log)
     assert (sigma[:, 2] > sigma[:, 0]).all()
     return sigma[:, 0].tolist(), notes[0]
@@ -36,3 +38,11 @@ def test_fixes_of_one_class_are_those_of_the_vehicle() -> None:
 def test_better_fixes_with_a_sigma_of_their_own_count_too() -> None:
     sigma, _ = horizontal_m([Fix.SINGLE], every=[Fix.FIXED, Fix.SINGLE])
     assert sigma == pytest.approx([3.0])
+
+
+def test_fixes_better_than_the_receiver_have_the_sigma_of_their_class() -> None:
+    """A vehicle file that extends 'generic' says 1.5 m, of a stand-alone receiver; the log has RTK."""
+    sigma, note = horizontal_m([Fix.FIXED, Fix.SINGLE], vehicle="generic")
+    assert sigma == pytest.approx([0.02, 3.0])
+    assert note.endswith("taken from assumed by class, flat: single 3 m, fixed 0.02 m")
+    assert horizontal_m([Fix.SINGLE], vehicle="generic")[0] == pytest.approx([1.5])

@@ -348,7 +348,7 @@ def test_sigmas_that_are_missing_are_those_of_the_class(tmp_path: Path, header: 
     assert any("gnss: 2 fixes have no sigma; taken from assumed by class" in note for note in recording.notes)
     own = open_recording(folder, rig=load_vehicle("husky").rig())
     assert own.gnss is not None
-    assert own.gnss.sigma_enu_m[:, 0].tolist() == [3.0, 2.1]  # the vehicle's is that of the best class
+    assert own.gnss.sigma_enu_m[:, 0].tolist() == [3.0, 0.02]  # its stand-alone receiver made no RTK fix
 
 
 def test_angles_that_start_again_after_each_turn_count_turns(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
+from terrafusion.twin.model.vehicle import load_vehicle
 
 DATUM = (48.1, 11.5, 520.0)
 START = "2024-02-29T23:59:58"
@@ -144,6 +145,14 @@ def test_sigma_from_hdop_is_told(tmp_path: Path) -> None:
     assert recording.gnss is not None
     np.testing.assert_allclose(recording.gnss.sigma_enu_m[0], [4.5, 4.5, 9.0])
     assert any("HDOP times" in note for note in recording.notes)
+
+
+def test_sigma_from_hdop_is_that_of_the_class_where_the_receiver_is_coarser(tmp_path: Path) -> None:
+    """The receiver of 'generic' has 1.5 m: no RTK."""
+    text = "".join(gga(k, p, 4, hdop="0.8") + rmc(k, p) for k, p in enumerate(llh_of()))
+    recording = open_recording(log(tmp_path, text), rig=load_vehicle("generic").rig())
+    assert recording.gnss is not None
+    np.testing.assert_allclose(recording.gnss.sigma_enu_m[0], [0.016, 0.016, 0.032])
 
 
 @pytest.mark.parametrize("mode", [",,,A", ",,,D", ",,,F", "", ",,,N"])
