@@ -102,6 +102,12 @@ def repaired_rows(times: Mapping[str, TimesNs]) -> dict[str, RowTimes]:
     return found
 
 
+def set_back(t_ns: TimesNs, name: str) -> int | None:
+    """First row whose clock was set back before it; rows that merely arrived out of order are not meant."""
+    steps = _steps(t_ns, name, None)
+    return steps[0][0] if steps else None
+
+
 def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:
     """Stable order (N,) that sorts rows by time; None where they are sorted."""
     return np.argsort(t_ns, kind="stable") if (t_ns[1:] < t_ns[:-1]).any() else None

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
-from terrafusion.datasets.core.clock import in_order, repair_together, sorting
+from terrafusion.datasets.core.clock import in_order, repair_together, set_back, sorting
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.ros.streams import Stream
@@ -39,10 +39,10 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool)
     header clocks do not agree. Messages without a header then take their receipt time, brought
     onto the header clock when the two clocks are more than a second apart.
 
-    With `repair_clock` steps of the clock are taken out, and messages out of order sorted.
+    Messages that arrived out of order are sorted. With `repair_clock` steps of the clock are taken out.
 
     Raises:
-        DataError: stamps that run backwards, or header stamps that are zero in part.
+        DataError: a clock that was set back, or header stamps that are zero in part.
     """
     timing = StreamTimes({kind: _in_file_order(stream) for kind, stream in streams.items()})
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
@@ -113,8 +113,9 @@ def _on_one_clock(
         timing.notes += _leaps(headed, beside)
     spread_s, far = _spread(headed, receipt)
     if spread_s > CLOCK_TOLERANCE_S:
+        topics = (timing.streams[kind].topic for kind in (_most_frequent(headed), far))
         timing.notes.append(
-            f"header clocks differ by {spread_s:.3g} s between topics ({timing.streams[far].topic}); "
+            f"header clocks differ by {spread_s:.3g} s between {' and '.join(topics)}; "
             "receipt stamps used for all"
         )
         return {}, ()
@@ -154,13 +155,13 @@ def _starts_at_zero(header_ns: TimesNs, zero: NDArray[np.int64]) -> bool:
 
 
 def _refuse_backwards(stream: Stream, t_ns: TimesNs, which: str, remedy: str) -> None:
-    step = np.diff(t_ns)
-    back = np.flatnonzero(step < 0)
-    if back.size:
+    """Refuse a clock that was set back. Messages that arrived out of order have correct times."""
+    row = set_back(t_ns, stream.topic)
+    if row is not None:
         raise DataError(
-            f"{which} stamps run backwards by {-step[back[0]] * 1e-9:.6f} s",
+            f"{which} stamps run backwards by {(t_ns[row - 1] - t_ns[row]) * 1e-9:.6f} s",
             channel=stream.topic,
-            time_s=_since(stream, int(back[0]) + 1) if which == "header" else _since(stream, int(back[0])),
+            time_s=_since(stream, row if which == "header" else row - 1),
             remedy=remedy,
         )
 
