@@ -59,7 +59,7 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
                 f"{len(names)} sensors of one kind: {', '.join(rates)}",
                 file=log,
                 channel=kind,
-                remedy=f"choose with --topic {kind}={names[0]}",
+                remedy="choose with " + " or ".join(f"--topic {kind}={name}" for name in names),
             )
         print(f"{kind}: which of these?")
         for number, shown in enumerate(rates, 1):

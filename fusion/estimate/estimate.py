@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.display import text_html
+from terrafusion.datasets.core.frames import yaw_of
 from terrafusion.datasets.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class WeightChange:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class State:
     """The estimate at one time.
 
@@ -81,6 +82,17 @@ class State:
     status: str
     slipping: bool = False
     immobilised: bool = False
+
+    def __repr__(self) -> str:
+        x_m, y_m, z_m = self.position_m
+        sigma_m = float(np.sqrt(0.5 * self.covariance[:2, :2].trace()))
+        ground = max(self.terrain, key=self.terrain.__getitem__, default="unknown")
+        return (
+            f"State at {self.t_ns} ns: {self.status}, position ({x_m:.2f}, {y_m:.2f}, {z_m:.2f}) m, "
+            f"1 sigma {sigma_m:.2g} m, yaw {float(yaw_of(self.quaternion)):.3f} rad, "
+            f"speed {float(np.linalg.norm(self.velocity_mps)):.2f} m/s, "
+            f"slip {self.slip:.3f} +- {self.slip_sigma:.2g}, ground {ground}"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -247,10 +247,11 @@ def _one_sensor(
     if decide is not None and found:
         return decide(kind, found)
     listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in candidates)
+    options = " or ".join(f"--topic {kind}={topic.name}" for topic in candidates)
     raise DataError(
         f"{len(candidates)} sensors of one kind: {listed}",
         channel=kind,
-        remedy=f"choose with --topic {kind}={candidates[0].name} (or topics={{'{kind}': ...}} in Python)",
+        remedy=f"choose with {options} (or topics={{'{kind}': ...}} in Python)",
     )
 
 

@@ -61,6 +61,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"lat(?:itude)?", "gnss", ("latitude_deg",)),
     (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
     (r"alt|altitude|height|h", "gnss", ("height_m",)),
+    (r"(?:fix_)?quality|q", "gnss", ("fix",)),
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
         (rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel)_?{a}", "imu", (f"gyro_{a}_radps",))
@@ -142,6 +143,8 @@ def _header(name: str) -> _Header:
                 break
     if known == "ticks" and not bracketed:
         base = f"{base}_ticks"
+    if not known and "rpm" in base.split("_"):  # rpm_left
+        known = "rpm"
     return _Header(name, re.sub(r"^(imu|gps|gnss|odom|robot)_(?=.)", "", base), known)
 
 
@@ -165,6 +168,8 @@ def _entry(header: _Header, field: str) -> str:
     name = json.dumps(header.column, ensure_ascii=False)
     if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
         return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
+    if field == "fix":
+        return f"{{column: {name}, unit: nmea}}"
     own = next(iter(units_of(field)))
     if header.column == field or header.unit in ("", own):
         return name

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recording
 from tests.datasets.readers.test_table import GYRO_MAP, table
@@ -24,6 +25,10 @@ HEADERS = {
         "1714564800000.5,1.5707963267948966,2,48,11",
     ),
     "no unit of time": ("t,yaw_rate_dps,speed_mps,lat,lon", "1714564800000.5,90,2,48,11"),
+    "rpm and quality": (
+        "t,gz_dps,RPM_L,RPM_R,lat,lon,fix_quality",
+        "1714564800.0005,90,19.098593171027442,19.098593171027442,48,11,4",
+    ),
     "decimal commas": ("time;gz [deg/s];speed;lat;lon", "1714564800,0005;90,0;2,0;48,0;11,0"),
 }
 
@@ -44,6 +49,8 @@ def test_the_proposed_map_reads_units_in_headers(tmp_path: Path, case: str) -> N
     assert recording.gnss is not None
     if "acc_z" in header:
         assert recording.imu.accel_mps2[0, 2] == 9.80665
+    if "quality" in header:
+        assert recording.gnss.fix.tolist() == [Fix.FIXED]
     assert any("decimal commas" in note for note in recording.notes) == (case == "decimal commas")
 
 

@@ -76,6 +76,17 @@ def test_what_is_shown_is_short(log: tf.Recording, result: tf.Replay) -> None:
         assert "<" in shown._repr_html_()
 
 
+def test_a_live_state_is_one_line(log: tf.Recording) -> None:
+    estimator = tf.Estimator.for_vehicle("elevate")
+    for message in log.messages():
+        estimator.add(message)
+        if (state := estimator.latest()) is not None:
+            break
+    assert state is not None
+    assert len(repr(state).splitlines()) == 1
+    assert f"State at {state.t_ns} ns: {state.status}, position (" in repr(state)
+
+
 def test_an_effect_may_be_named_alone() -> None:
     bare = tf.simulate("straight", effects={"slope": 0.05})
     full = tf.simulate("straight", effects={"slope/uniform": 0.05})

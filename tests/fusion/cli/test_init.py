@@ -93,7 +93,7 @@ def test_two_imus_are_listed_and_one_must_be_chosen(bag: Path, tmp_path: Path) -
     assert done.exit_code == 1
     error = str(done.exception)
     assert "2 sensors of one kind: /rover/front/imu (100 Hz), /rover/rear/imu (100 Hz)" in error
-    assert "--topic imu=/rover/front/imu" in error
+    assert "choose with --topic imu=/rover/front/imu or --topic imu=/rover/rear/imu" in error
     assert not (tmp_path / "own.yaml").exists()
 
 
