@@ -1,12 +1,15 @@
-"""How far the IMU of a robot is tilted against its body, from one drive."""
+"""How the IMU of a robot is turned against its body: its tilt, and which axis is forward, from one drive."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from terrafusion.datasets.checks import CheckContext
+from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import imu_kind
 from terrafusion.fusion.init.draft import Draft, DraftLine
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -17,6 +20,8 @@ LEAST_SIGMA_RAD = math.radians(0.5)
 """Of a tilt that is found: bias of the accelerometer, load and tyres (assumed)."""
 SEEN_SIGMAS, LEAST_TILT_RAD = 3.0, math.radians(2.0)
 """A tilt is corrected from so many sigma on, and no less than this."""
+FORWARD_SIGMA_RAD = 0.4
+"""1 sigma of the IMU's angle about z where acceleration shows that it is not turned by a quarter."""
 MOST_ALONG = 0.4
 """Headings cover the circle where their mean direction is no longer than this; 1 is a straight drive."""
 
@@ -76,3 +81,15 @@ def tilt_lines(tilt: Tilt | None, log: str) -> tuple[Draft, tuple[str, ...]]:
         name: DraftLine(KnownNumber(round(value, 4), "calibrated", round(tilt.sigma_rad, 4), (log,)), comment)
         for name, value in (("imu_roll_rad", tilt.roll_rad), ("imu_pitch_rad", tilt.pitch_rad))
     }, ()
+
+
+def forward_line(recording: Recording, rig: Rig) -> Draft:
+    """A line of the file where acceleration follows the wheels along x: the IMU is not turned by a quarter.
+
+    No more is taken from it, as the lever arm of the IMU bends that direction.
+    """
+    found = heading(CheckContext(recording, rig))
+    if found is None or found.angle is None or abs(found.angle) + found.spread > 0.25 * math.pi:
+        return {}
+    number = KnownNumber(0.0, "calibrated", FORWARD_SIGMA_RAD, (recording.name,))
+    return {"imu_yaw_rad": DraftLine(number, "rad; about z; acceleration follows the wheels along x")}

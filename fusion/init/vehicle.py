@@ -23,7 +23,7 @@ from terrafusion.fusion.estimator.feed import wheels_of
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
 from terrafusion.fusion.init.geometry import geometry_lines, radius_line
-from terrafusion.fusion.init.level import measure_tilt, tilt_lines
+from terrafusion.fusion.init.level import forward_line, measure_tilt, tilt_lines
 from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
 from terrafusion.twin.model.choose import named_vehicle
 from terrafusion.twin.model.library import known_names
@@ -116,10 +116,12 @@ def first_vehicle(
             measured, geometry = _geometry(mounted.recording, answers, base, rig)
         tilted, tilt_notes = tilt_lines(measure_tilt(mounted.recording, base), mounted.recording.name)
         draft = head | geometry | tail | tilted
-        calibration, notes = _calibrated(mounted.recording, write_draft(file, draft, "draft"), progress)
+        forward = forward_line(mounted.recording, load_vehicle(write_draft(file, draft, "draft")).rig())
+        start = write_draft(file, draft | forward, "draft")
+        calibration, notes = _calibrated(mounted.recording, start, progress)
         findings = mounted.findings
         if calibration is not None:
-            draft |= _learned_lines(calibration, draft)
+            draft |= forward | _learned_lines(calibration, draft)
             learned = load_vehicle(write_draft(file, draft, "draft")).rig()
             findings = tuple(run_checks(mounted.recording, learned))
     if extended != "generic":

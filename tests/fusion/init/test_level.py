@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.init.draft import write_draft
-from terrafusion.fusion.init.level import measure_tilt, tilt_lines
+from terrafusion.fusion.init.level import FORWARD_SIGMA_RAD, forward_line, measure_tilt, tilt_lines
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -72,3 +73,16 @@ def test_without_six_axes_nothing_is_measured(drive: Recording) -> None:
     flat = dataclasses.replace(drive.imu, accel_mps2=np.full_like(drive.imu.accel_mps2, np.nan))
     assert measure_tilt(dataclasses.replace(drive, imu=flat), BASE) is None
     assert measure_tilt(dataclasses.replace(drive, wheels=None), BASE) is None
+
+
+def test_acceleration_shows_that_the_imu_is_not_turned_by_a_quarter(drive: Recording) -> None:
+    """The estimator then needs no drive to find that out; of an IMU that is turned nothing is claimed."""
+    (line,) = forward_line(drive, BASE.rig()).values()
+    assert isinstance(line.value, KnownNumber)
+    assert (line.value.value, line.value.sigma) == (0.0, FORWARD_SIGMA_RAD)
+    assert drive.imu is not None
+    R = gtsam.Rot3.Rz(0.5 * math.pi).matrix()
+    imu = dataclasses.replace(
+        drive.imu, gyro_radps=drive.imu.gyro_radps @ R, accel_mps2=drive.imu.accel_mps2 @ R
+    )
+    assert not forward_line(dataclasses.replace(drive, imu=imu), BASE.rig())
