@@ -254,4 +254,6 @@ def _named(usable: Sequence[BagTopic], joints_of: Callable[[str], Sequence[str]]
                 "--topic joint.right=NAME, or four with joint.front_left, ..."
             )
         elif not looks_fused("wheels", topic):  # which has a note of its own
-            yield f"--topic wheels={topic.name} uses this {topic.msgtype} if it is measured, not commanded"
+            steers = topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED)
+            options = " ".join(f"--topic {kind}={topic.name}" for kind in ("wheels", "steering")[: 1 + steers])
+            yield f"{options} uses this {topic.msgtype} if it is measured, not commanded"

@@ -143,3 +143,7 @@ def test_ackermann_drive(tmp_path: Path, ros: int, stamped: bool) -> None:
     assert recording.wheels.names == ("speed",)
     assert recording.wheels.speed.tolist() == [[1.5], [1.5]]
     assert "steering /vehicle/state" in recording.source
+    commands = [message for message in messages if message[0] != "/vehicle/state"]
+    unasked = open_recording(write(tmp_path / "b.bag", commands))
+    option = "--topic wheels=/ackermann_cmd --topic steering=/ackermann_cmd uses this"
+    assert any(option in note for note in unasked.notes)
