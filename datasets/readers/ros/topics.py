@@ -255,5 +255,6 @@ def _named(usable: Sequence[BagTopic], joints_of: Callable[[str], Sequence[str]]
             )
         elif not looks_fused("wheels", topic):  # which has a note of its own
             steers = topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED)
-            options = " ".join(f"--topic {kind}={topic.name}" for kind in ("wheels", "steering")[: 1 + steers])
+            kinds = ("wheels", "steering") if steers else ("wheels",)
+            options = " ".join(f"--topic {kind}={topic.name}" for kind in kinds)
             yield f"{options} uses this {topic.msgtype} if it is measured, not commanded"

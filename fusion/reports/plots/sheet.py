@@ -190,7 +190,8 @@ class Plot:
             "size": size,
             "marker": "circle" if ring else marker,
         }
-        self.glyph("scatter", {"x": x, "y": y}, label, colour, "ring" if ring else "dot", **look)
+        form = marker if marker in ("ring", "triangle", "square") else "dot"
+        self.glyph("scatter", {"x": x, "y": y}, label, colour, form, **look)
 
     def glyph(
         self, kind: str, data: Mapping[str, ArrayLike], label: str, colour: Any, form: str, *,

@@ -290,6 +290,14 @@ def test_a_ground_that_nothing_tells_colours_nothing(drive):
     assert not {"unknown", "on unknown"} & entries[1]
 
 
+def test_the_legend_of_the_map_shows_start_and_end_as_the_map_does(drive):
+    d = drive(seconds=20.0)
+    sheet = Sheet(20.0, start_ns=d.recording.start_ns)
+    plots_map.plot_map(sheet, {"a": d.estimate}, "a", d.recording, COLOURS, errors={})
+    (legend,) = (panel.legend for panel in sheet.panels.values())
+    assert (legend["start"].form, legend["end"].form) == ("triangle", "square")
+
+
 def test_single_precision_is_used_only_where_it_is_exact_enough():
     assert compact(np.array([1.0, np.nan])).dtype == np.float32
     assert compact(np.array([5.4e6, 5.4e6 + 0.01])).dtype == np.float64
