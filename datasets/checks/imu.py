@@ -115,9 +115,14 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
         repair = scaled("imu", GRAVITY_MPS2, "accel_mps2")
         yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
         return
-    removed = ": gravity has been removed" if size < REMOVED_SHARE * GRAVITY_MPS2 else ""
-    what = f"mean specific force is {size:.2f} m/s2, not 9.8{removed}"
+    what = f"mean specific force is {size:.2f} m/s2, not 9.8"
     fix = "give raw accelerometer data in m/s2, gravity included"
+    if size < REMOVED_SHARE * GRAVITY_MPS2:
+        what += ": gravity has been removed"
+        fix = f"leave the accelerometer out (better: {fix})"
+        repair = changed_field("imu", "accel_mps2", lambda accel: np.full_like(accel, np.nan))
+        yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix, repair)
+        return
     yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix)
 
 

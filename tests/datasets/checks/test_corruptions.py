@@ -229,7 +229,7 @@ IMU_CASES: dict[str, Case] = {
     "accel: in g": Case(change("imu", accel_mps2=lambda a: a / 9.80665), "accel-in-g", "imu"),
     "accel: gravity removed": Case(
         change("imu", accel_mps2=lambda a: a - np.array([0.0, 0.0, 9.80665])),
-        "accel-magnitude", "imu", repaired=False,
+        "accel-magnitude", "imu", good=change("imu", accel_mps2=lambda a: np.full_like(a, np.nan)),
     ),
     "accel: saturated": Case(
         change("imu", accel_mps2=lambda a: np.clip(a, -10.2, 10.2)),

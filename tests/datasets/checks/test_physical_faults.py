@@ -368,7 +368,6 @@ def level(rig: Rig) -> Any:
 
 
 FOUND: dict[str, tuple[Fault, str, str]] = {
-    "gravity removed": (imu_with(accel_mps2=lambda a: a - [0.0, 0.0, 9.81]), "accel-magnitude", "error"),
     "mounted at 45 deg": (tilted, "imu-axes", "error"),
     "left side of y": (imu_with(accel_mps2=times(1, -1, 1)), "accel-mirrored", "warning"),
     "gyro of another drive": (other_gyro, "yaw-unrelated", "warning"),

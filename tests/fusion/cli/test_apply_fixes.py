@@ -68,7 +68,7 @@ def test_nothing_is_changed_unasked(log: Path, terrafusion) -> None:
 
 def test_unrepaired_findings_are_reported(log: Path, terrafusion) -> None:
     table = pd.read_csv(log / "imu.csv")
-    table["accel_z_mps2"] -= 9.80665
+    table["accel_z_mps2"] *= 0.5
     table.to_csv(log / "imu.csv", index=False)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert outcome.status == 0
@@ -77,7 +77,18 @@ def test_unrepaired_findings_are_reported(log: Path, terrafusion) -> None:
         line for line in outcome.out.splitlines() if line.startswith("error: accel-magnitude, imu")
     )
     assert remaining.endswith("[remains: the correct values are unknown]")
-    assert terrafusion("replay", "out", "--out", "results").refused("gravity has been removed")
+    assert terrafusion("replay", "out", "--out", "results").refused("m/s2, not 9.8")
+
+
+def test_a_log_without_gravity_is_replayed_by_its_gyro(log: Path, terrafusion) -> None:
+    table = pd.read_csv(log / "imu.csv")
+    table["accel_z_mps2"] -= 9.80665
+    table.to_csv(log / "imu.csv", index=False)
+    assert terrafusion("replay", "log", "--out", "results").refused(
+        "gravity has been removed", "--apply-fixes"
+    )
+    assert terrafusion("convert", "log", "out", "--apply-fixes").status == 0
+    assert terrafusion("replay", "out", "--out", "results").status == 0
 
 
 def test_a_refused_replay_names_the_remedy(log: Path, terrafusion) -> None:
