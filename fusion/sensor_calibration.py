@@ -172,6 +172,12 @@ def calibrate_sensors(
     ready = [(log, _learner(log, params)) for log in recordings]
     left_out = [log.name for log, learner in ready if learner is None]
     notes += tuple(f"{name}: left out, it has no fixes or no source of yaw" for name in left_out)
+    notes += tuple(
+        f"{log.name}: the vehicle's numbers are from a log of this name already; if it is the same, it "
+        "counts twice and sigma is too small: give other drives"
+        for log in recordings
+        if any(isinstance(one, KnownNumber) and log.name in one.logs for one in vars(params.robot).values())
+    )
     learners = [(log, learner) for log, learner in ready if learner is not None]
     yaw = _one_source_of_yaw(learners)
     earlier: _Learner | None = None

@@ -103,6 +103,16 @@ def test_the_second_log_starts_from_the_first(logs: list[Recording], found: Sens
         assert found.numbers[name].sigma_before == first.numbers[name].sigma_before
 
 
+def test_a_log_that_counts_twice_is_noted(
+    logs: list[Recording], found: SensorCalibration, tmp_path: Path
+) -> None:
+    path = write_robot(tmp_path / "my_robot.yaml", found)
+    again = calibrate_sensors([logs[0], dataclasses.replace(logs[1], name="wednesday")], path)
+    (note,) = (note for note in again.notes if "counts twice" in note)
+    assert note.startswith("monday: ")
+    assert not any("counts twice" in note for note in found.notes)
+
+
 def test_the_file_carries_the_numbers_to_the_next_replay(
     logs: list[Recording], found: SensorCalibration, tmp_path: Path
 ) -> None:
