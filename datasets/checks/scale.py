@@ -29,6 +29,8 @@ SOFT = ("medium_sand", "loose_sand", "ploughed_soil", "mud", "snow", "ice")
 UNIT_ERROR = 0.1
 FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
+LARGEST_WHEEL_M = 0.5
+"""Radius up to which a robot's wheels are expected."""
 STEEPEST = 0.05
 """Mean descent above which a robot may roll faster than its braked wheels."""
 YAW_WINDOW_S, LEAST_YAW_WINDOWS, LEAST_YAW_R = 4.0, 12, 0.95
@@ -76,12 +78,15 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
     elif (scale.ratio < SMALL * known or scale.high < FIRM_SLIP * known) and is_firm(context.recording):
         fitting = f"radius ({radius * scale.ratio:.4f} m fits)" if wheels.unit == "radps" else "speeds"
+        fix = f"it may be slip; if the ground is firm, check wheel {fitting} and unit"
+        if wheels.unit == "mps" and scale.ratio < LARGEST_WHEEL_M:
+            fix += f": rad/s of a wheel with a radius of {scale.ratio:.3f} m would read so"
         yield Finding(
             "wheel-scale", "warning", "wheels",
             f"the wheels read {1.0 / scale.ratio - 1.0:.1%} too much: ground speed is {scale.ratio:.3f} "
             "times the wheel speed",
             evidence,
-            f"it may be slip; if the ground is firm, check wheel {fitting} and unit",
+            fix,
         )  # fmt: skip
 
 

@@ -156,6 +156,17 @@ def test_a_descent_needs_fixes_that_lie_apart(drive: Recording) -> None:
         assert scale._descent(short) == pytest.approx(descent)
 
 
+def test_rad_s_in_a_column_of_m_s_is_a_possible_reason(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert drive.wheels is not None
+    log = dataclasses.replace(drive, wheels=dataclasses.replace(drive.wheels, unit="mps"))
+    (finding,) = judged(log, monkeypatch, 0.117, spread=0.2)
+    assert finding.fix.endswith("and unit: rad/s of a wheel with a radius of 0.117 m would read so")
+    (finding,) = judged(log, monkeypatch, 0.7)
+    assert finding.fix.endswith("check wheel speeds and unit")
+
+
 def test_soft_ground_explains_slip(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     assert codes(judged(drive, monkeypatch, 0.7)) == ["wheel-scale"]
     (finding,) = judged(drive, monkeypatch, 0.7)
