@@ -118,10 +118,13 @@ def replay(
     found = run_checks(recording, rig) if findings is None else findings
     corrections = estimator.learned.corrections()
     verdict = judge(Run(recording, estimate, scores, alone, drive.used, found, rig, corrections))
+    learned_grounds = estimator.weights.learned_grounds()
+    if learned_grounds is not None and not learned_grounds.robot:
+        learned_grounds.robot = drive.vehicle.name
     return ReplayResult(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
         drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
-        alone, verdict, drive.assumed, estimator.learned.table(), estimator.weights.learned_grounds(),
+        alone, verdict, drive.assumed, estimator.learned.table(), learned_grounds,
         estimator.weights.found_shares(),
     )  # fmt: skip
 

@@ -107,7 +107,7 @@ def replay(
             grounds=memory, findings=findings, progress=progress,
         )  # fmt: skip
     unseen = _write(result, out, mcap, rerun, grounds)
-    return _shown(result, findings, unseen, out)
+    return _shown(result, findings, unseen, out, grounds)
 
 
 def _outage(text: str) -> Outage:
@@ -156,11 +156,15 @@ def _write(
     return unseen
 
 
-def _shown(result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[str], out: Path) -> Result:
+def _shown(
+    result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[str], out: Path, grounds: Path | None
+) -> Result:
     """What the command prints, the verdict first."""
     warnings = [_warning(finding, result.learned) for finding in findings]
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
     done = f"written to {out}"
+    if grounds is not None and result.grounds is not None:
+        done += f"; {len(result.grounds)} grounds of '{result.grounds.robot}' to {grounds}"
     short = f"{result.verdict.lines()[0]}; {done}"
     return Result(lines, done, common.read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
 

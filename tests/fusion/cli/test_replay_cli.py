@@ -171,6 +171,14 @@ def test_husky(husky_bag: Path, tmp_path: Path, terrafusion) -> None:
     assert metrics["outages"] == []
 
 
+def test_grounds_are_written_with_the_name_of_the_robot(drive: Path, tmp_path: Path, terrafusion) -> None:
+    grounds = tmp_path / "grounds.yaml"
+    for _ in ("new", "known"):
+        done = terrafusion("replay", drive, "--grounds", grounds, "--out", tmp_path / "out")
+        assert done.out.splitlines()[-1].endswith(f" grounds of 'elevate' to {grounds}")
+        assert "robot: elevate" in grounds.read_text()
+
+
 def test_a_file_for_a_folder_is_refused_before_anything_is_computed(
     terrafusion: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
