@@ -40,8 +40,8 @@ def train(
 ) -> Result:
     """Train the terrain model of a robot on its labelled logs, or the shipped one on simulated runs.
 
-    A model of logs goes to `replay --terrain-model`. Without logs the twin
-    drives over soils, slopes, payloads and speeds; one more seed calibrates the
+    A model of logs takes two or more of each ground, and goes to `replay --terrain-model`. Without logs the
+    twin drives over soils, slopes, payloads and speeds; one more seed calibrates the
     probabilities and one scores the model. Stopped, the same command continues.
 
     Example: terrafusion terrain train --out grounds.yaml monday.bag tuesday.bag --vehicle my_robot.yaml

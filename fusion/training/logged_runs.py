@@ -79,5 +79,5 @@ def labelled_grounds(recording: Recording) -> list[tuple[int, str]]:
     """Start (ns) and name of each ground of a run, "" where unlabelled; a DataError without a true label."""
     if grounds := true_grounds(recording):
         return grounds
-    remedy = "name it in meta.yaml ('terrain'), or add terrain.csv"
+    remedy = "name it in meta.yaml or the column map ('terrain'), or add terrain.csv (convert a bag first)"
     raise DataError(f"{recording.name}: no ground label", channel="terrain", remedy=remedy)

@@ -159,7 +159,7 @@ def test_a_log_that_lacks_something_is_refused(changes: dict[str, object], words
 
 def test_labels_of_the_detector_itself_are_none() -> None:
     guess = Terrain(nanoseconds(np.array([0.0])), np.array(["mud"]), "detector")
-    with pytest.raises(DataError, match="no ground label"):
+    with pytest.raises(DataError, match=r"no ground label; name it in meta.yaml or the column map"):
         logged_samples(dataclasses.replace(circled(), terrain=guess, terrain_name=""))
 
 
