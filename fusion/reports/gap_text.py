@@ -72,17 +72,22 @@ def verdict_line(d: GapDiagnosis) -> str:
         like = "the references among themselves" if d.references else "the twin's own runs"
         return f"No gap: the runs differ no more than {like} ({_test(d)})."
     if verdict.kind == "unknown":
-        certain = f"{percent(verdict.p_unknown)} certain"
+        certain = _certain(d, verdict.p_unknown)
         return f"Gap of unknown cause: no effect of the catalogue explains it ({certain})."
-    certain = f"{percent(sets[0].probability)} certain" if sets else "not certain"
+    certain = _certain(d, sets[0].probability) if sets else "not certain"
     if verdict.kind == "parameters":
         own = next(c.probability for c in verdict.causes if c.effect in verdict.named)
-        certain = f"{percent(own)} certain"  # not of what it resembles
+        certain = _certain(d, own)  # not of what it resembles
         return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
     if len(sets) > 1:
         both = "; and ".join(map(alternatives_text, sets))
         return f"Gap caused by {len(sets)} effects together ({certain}): {both}."
     return f"Gap caused by {alternatives_text(sets[0], certain)}."
+
+
+def _certain(d: GapDiagnosis, probability: float) -> str:
+    """A probability, with its condition where too few references show the errors of the twin."""
+    return f"{percent(probability)} certain{', if the twin is right' if d.uncalibrated else ''}"
 
 
 def named_sets(d: GapDiagnosis) -> list[CredibleSet]:

@@ -335,6 +335,7 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
     assert answer["reference_runs"] == []
     assert answer["where"] == []
     assert any("that takes 2 references" in line for line in screen(unreferred))
+    assert "% certain, if the twin is right" in " ".join(screen(unreferred))
     assert answer["shrink"]["floor"] is None
     assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
 
