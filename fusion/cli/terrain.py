@@ -74,7 +74,8 @@ def train_on_logs(logs: list[str], vehicle: str | None, out: Path) -> Result:
     from terrafusion.fusion.training.train_detector import write_model
     from terrafusion.fusion.training.train_on_logs import train_on
 
-    runs = open_runs(logs, vehicle)
+    with progress("logs", len(logs)) as tick:
+        runs = open_runs(logs, vehicle, tick)
     made_by = f"terrafusion terrain train --out {out.name}, {len(runs)} runs"
     model = train_on(runs, hashes_of(logs), made_by)
     write_model(model, out)
@@ -134,7 +135,8 @@ def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out:
     from terrafusion.fusion.training.train_on_logs import cross_validated, scores_on
 
     loaded = None if model is None else untrained_on(model, logs)
-    runs = open_runs(logs, vehicle)
+    with progress("logs", len(logs)) as tick:
+        runs = open_runs(logs, vehicle, tick)
     scores, spliced = cross_validated(runs) if loaded is None else (scores_on(loaded, runs), None)
     report = {**dataclasses.asdict(scores), "inputs": hashes_of(logs)}
     lines = score_lines(f"{len(runs)} runs", scores)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from terrafusion.fusion.terrain.classifier import UNKNOWN
 from terrafusion.fusion.terrain.external import true_grounds
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.training.detector_scores import LabelledRoute, changes_in
+from terrafusion.twin.model.vehicle import load_vehicle
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +33,22 @@ class LoggedRun:
         return set(self.route.labels.tolist())
 
 
-def open_runs(logs: Sequence[str], vehicle: str | None = None) -> list[LoggedRun]:
+def open_runs(
+    logs: Sequence[str], vehicle: str | None = None, tick: Callable[[], None] | None = None
+) -> list[LoggedRun]:
     """The labelled runs of one robot's logs: files, folders, or catalogue names; `vehicle` instead of theirs.
+
+    `tick` is called after each log.
 
     Raises:
         DataError: a run without ground labels, nothing that moves, or logs of several vehicles.
         TerrafusionError: a log cannot be read or replayed.
     """
-    found = [run_of(recording, vehicle) for log in logs for recording in open_recordings(log)]
+    rig, found = None if vehicle is None else load_vehicle(vehicle).rig(), list[LoggedRun]()
+    for log in logs:
+        found += [run_of(recording, vehicle) for recording in open_recordings(log, rig=rig)]
+        if tick is not None:
+            tick()
     runs = [run for run in found if run.route.windows]
     names = sorted({run.vehicle for run in runs})
     if not runs:

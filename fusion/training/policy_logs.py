@@ -66,10 +66,12 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
         TerrafusionError: a log cannot be read.
     """
     from terrafusion.datasets.readers import hashes_of, open_recordings
+    from terrafusion.twin.model.vehicle import load_vehicle
 
     parts: dict[str, list[GroundSamples]] = {}
+    rig = None if vehicle is None else load_vehicle(vehicle).rig()
     for log in logs:
-        for recording in open_recordings(log):
+        for recording in open_recordings(log, rig=rig):
             for ground, samples in logged_samples(recording, vehicle).items():
                 parts.setdefault(ground, []).append(samples)
     grounds = {name: GroundSamples.joined(found) for name, found in parts.items()}

@@ -164,7 +164,9 @@ def test_labels_of_the_detector_itself_are_none() -> None:
 
 
 def test_too_little_driving_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda log: [circled(seconds=8.0)])
+    monkeypatch.setattr(
+        "terrafusion.datasets.readers.open_recordings", lambda log, rig: [circled(seconds=8.0)]
+    )
     with pytest.raises(DataError, match="slips on 'grass'"):
         read_logs(["made"])
 
@@ -226,7 +228,7 @@ def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("few_drives")
 def test_the_command_takes_soils_and_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda log: [circled()])
+    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda log, rig: [circled()])
     log = tmp_path / "drive.csv"
     log.write_text("any\n")
     out = tmp_path / "policy.yaml"

@@ -22,6 +22,7 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
+from terrafusion.fusion.training import logged_runs
 from terrafusion.fusion.training.detector_scores import changes_in
 from terrafusion.fusion.training.logged_runs import LoggedRun
 from terrafusion.fusion.training.train_detector import write_model
@@ -101,6 +102,21 @@ def test_a_run_whose_ground_looks_like_another_leaves_doubt(runs: list[LoggedRun
     for window in made_run(["gravel"], 90).route.windows:
         sure = float(detector.update(window).max())
     assert sure <= 1.0 - 0.75 * doubting.doubt
+
+
+def test_the_vehicle_tells_how_the_logs_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its topics, the mounting of its IMU and the sigmas of its receiver."""
+    rigs, read = list[object](), list[int]()
+
+    def opened(log: str, *, rig: object = None) -> list[tf.Recording]:
+        rigs.append(rig)
+        return []
+
+    monkeypatch.setattr(logged_runs, "open_recordings", opened)
+    with pytest.raises(DataError, match="does not move"):
+        logged_runs.open_runs(["monday", "tuesday"], "husky", lambda: read.append(1))
+    assert rigs == [as_vehicle("husky").rig()] * 2
+    assert len(read) == 2
 
 
 def test_a_run_over_several_grounds_counts_for_each() -> None:
