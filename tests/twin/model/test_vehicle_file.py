@@ -33,6 +33,7 @@ def written(path: Path, text: str) -> Path:
 def test_a_short_file_replaces_only_what_it_gives(tmp_path: Path) -> None:
     own, husky = load_vehicle(written(tmp_path / "own.yaml", SHORT)), load_vehicle("husky")
     assert (own.name, own.drive.type) == ("my_robot", "differential")
+    assert own.description == "as 'husky' but for what its own file says"
     assert own.wheel.radius_m == own.odometry.wheel_radius_m == 0.12
     assert own.body.track_m == own.odometry.track_m == 0.4
     assert own.measured == ("wheel.radius_m",)  # a data sheet is no measurement
