@@ -61,6 +61,15 @@ def read(request: Request) -> list[Recording]:
     return [dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))]
 
 
+def _as_one(logs: Sequence[str]) -> str:
+    """How the logs of a folder become one."""
+    if len(logs) < 2:
+        return ""
+    if all(name.endswith((".mcap", ".db3")) for name in logs):
+        return "; if they are one bag, `ros2 bag reindex` writes its metadata.yaml"
+    return "; if they are of one drive, join them (Plain tables in docs/reference/formats.md)"
+
+
 def _meta(folder: Path) -> Meta:
     """`meta.yaml`, with the path of a vehicle file that lies in the folder."""
     if not (folder / META).is_file():
@@ -69,6 +78,7 @@ def _meta(folder: Path) -> Meta:
         remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
         if logs:
             remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"
+            remedy += _as_one(logs)
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = parse_meta(read_yaml(folder / META), folder / META)
     vehicle = folder / expanded(meta.vehicle or "")

@@ -152,10 +152,11 @@ def _note(note: str | dict[str, Any], recordings: int) -> str:
 
 def _findings(page: dict[str, Any]) -> Iterator[Line]:
     yield "", ""
-    if "wheels" not in page["channels"]:
+    without_wheels = "wheels" not in page["channels"]
+    if without_wheels:
         yield from entry("missing", "yellow", "wheels, which replay and init need")
     if not page["findings"]:
-        yield "green", "no findings"
+        yield "green", "no findings in the other channels" if without_wheels else "no findings"
     for f in page["findings"]:
         style = "red" if f["severity"] == "error" else "yellow"
         yield from entry(f["severity"], style, f"{f['channel']}: {f['what']} [{f['code']}]")

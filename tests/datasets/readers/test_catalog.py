@@ -115,6 +115,17 @@ def test_a_folder_of_logs_names_them(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+def test_a_folder_of_several_logs_says_how_they_become_one(tmp_path: Path) -> None:
+    for name in ("gps.csv", "imu_data.csv"):
+        (tmp_path / name).write_text("a,b\n1,2\n")
+    with pytest.raises(DataError, match=r"gps.csv, imu_data.csv; if they are of one drive, join them"):
+        open_recording(tmp_path)
+    for number, name in enumerate(("gps.csv", "imu_data.csv")):
+        (tmp_path / name).rename(tmp_path / f"d_{number}.mcap").write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(DataError, match=r"d_0.mcap, d_1.mcap; if they are one bag, `ros2 bag reindex`"):
+        open_recording(tmp_path)
+
+
 def test_another_file_under_a_catalogued_name_is_not_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
