@@ -17,7 +17,7 @@ from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
 @dataclass(frozen=True)
 class TopicContents:
-    """A topic of a type that is read, and the times (N,) of its messages in order: stamps, else receipt."""
+    """A topic of a type that is read, and when its (N,) messages were received: one clock for all topics."""
 
     name: str
     msgtype: str
@@ -69,8 +69,7 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         chosen_topics(container, Request(path, topics=topics), open_to_the_user)
     contents = []
     for topic in usable:
-        stream = streams[topic.name, topic.msgtype]
-        t_ns = stream.receipt_ns if stream.header_ns is None else stream.header_ns
+        t_ns = streams[topic.name, topic.msgtype].receipt_ns
         if len(t_ns):  # the index of a bag may count messages that are not there
             contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
     others = [topic for topic in there if topic not in usable and topic.name != STATIC[0]]

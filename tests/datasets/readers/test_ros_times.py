@@ -11,6 +11,7 @@ import pytest
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.ros.contents import bag_contents
 from tests.datasets.ros_bags import MAKE1, MAKE2, T0, Message, write_ros1, write_ros2
 
 MS, S = 10**6, 10**9
@@ -177,6 +178,17 @@ def test_a_merged_bag_is_read_in_the_order_of_receipt(tmp_path: Path) -> None:
     recording = open_recording(write_ros2(tmp_path / "a", [*rows[200:], *rows[:200]]))
     assert recording.imu is not None
     assert recording.imu.t_ns.tolist() == [T0 + i * 10 * MS for i in range(400)]
+
+
+def test_the_contents_of_a_bag_are_by_the_clock_of_the_recorder(tmp_path: Path) -> None:
+    """An IMU stamps the time since it was switched on; its rows stand beside those of the others."""
+    rows: list[Message] = []
+    for k in range(20):
+        rows.append(("/imu", TYPES["/imu"], T0 + k * 10 * MS, MAKE1.imu(500 * S + k * 10 * MS)))
+        rows.append(("/fix", TYPES["/fix"], T0 + k * 10 * MS, MAKE1.fix(T0 + k * 10 * MS, 48.0, 11.0)))
+    contents = bag_contents(str(write_ros1(tmp_path / "a.bag", rows)))
+    assert contents is not None
+    assert [int(topic.t_ns[0]) for topic in contents.topics] == [T0, T0]
 
 
 def test_a_simulated_clock_may_start_at_zero(tmp_path: Path) -> None:
