@@ -72,7 +72,8 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
         entry = _at(out, place[:-1])[place[-1]]
         entry["source"] = f"assumed: as of '{robot.extends}', {entry['source']}"
     out["name"] = robot.name or out["name"]
-    out["description"] = robot.description or f"as '{robot.extends}' but for what its own file says"
+    if robot.description is not None or _shipped(robot.extends):
+        out["description"] = robot.description or f"as '{robot.extends}' but for what its own file says"
     if robot.drive is not None:
         out["drive"]["type"] = robot.drive
         if robot.drive not in STEERED_DRIVES:
