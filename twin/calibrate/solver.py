@@ -63,7 +63,6 @@ class Solution:
         outcome: key of `OUTCOMES`.
         runs: evaluations of the twin.
         first: the blocks at the start values.
-        history: cost after each accepted step, in nats, by pass.
     """
 
     point: Point
@@ -73,7 +72,6 @@ class Solution:
     outcome: str
     runs: int
     first: Sequence[ResidualBlock]
-    history: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +103,9 @@ def solve(
     noise = first_noise(problem) if start is None else start.noise
     first = evaluate(point)
     if first is None:
-        return Solution(point, (), None, noise, "diverged", evaluate.runs, (), ())
+        return Solution(point, (), None, noise, "diverged", evaluate.runs, ())
     here = _Linearised(point, first, problem.normal(point, first, noise))
-    outcome, history = "converged", []
+    outcome = "converged"
     for learn, goal in _passes(start is None):
         if learn is not None:
             new = learn(problem, here.blocks, here.normal, noise)
@@ -116,14 +114,11 @@ def solve(
                 continue
             noise = extrapolated(problem, noise, new) if learn is rescaled else new
             here = _renewed(problem, here, noise)
-        here, outcome, costs = _descend(evaluate, here, noise, free, goal)
-        history.append(costs)
+        here, outcome = _descend(evaluate, here, noise, free, goal)
     if start is None:
         noise = rescaled(problem, here.blocks, here.normal, noise)
         here = _renewed(problem, here, noise)
-    return Solution(
-        here.point, here.blocks, here.normal, noise, outcome, evaluate.runs, first, tuple(history)
-    )
+    return Solution(here.point, here.blocks, here.normal, noise, outcome, evaluate.runs, first)
 
 
 def _renewed(problem: Problem, here: _Linearised, noise: NoiseModel) -> _Linearised:
@@ -169,18 +164,18 @@ class _Evaluator:
 
 def _descend(
     evaluate: _Evaluator, here: _Linearised, noise: NoiseModel, free: NDArray[np.bool_], goal: float
-) -> tuple[_Linearised, str, tuple[float, ...]]:
-    """Steps until one is predicted to gain less than `goal`: where that is, the outcome and the costs."""
-    problem, damping, costs = evaluate.problem, DAMPING[0], [here.normal.cost]
+) -> tuple[_Linearised, str]:
+    """Steps until one is predicted to gain less than `goal`: where that is, and the outcome."""
+    problem, damping = evaluate.problem, DAMPING[0]
     while True:
         normal = here.normal
         held = _held(evaluate, here, free)
         gain = _predicted_gain(normal, _step(normal, held, 0.0))
         if gain < goal:
             bound = bool((held[: len(free)] & free).any())
-            return here, "at_bound" if bound else "converged", tuple(costs)
+            return here, "at_bound" if bound else "converged"
         if evaluate.runs >= MAX_RUNS:
-            return here, "too_long", tuple(costs)
+            return here, "too_long"
         d = _step(normal, held, damping)
         d = d * min(1.0, MAX_STEP / max(float(np.abs(d[: len(free)]).max()), 1e-300))
         point = here.point.moved(*problem.step(normal, d))
@@ -194,11 +189,10 @@ def _descend(
             elif share < 0.25:
                 damping *= 3.0
             here = new
-            costs.append(new.normal.cost)
         else:
             damping *= 10.0
             if damping > DAMPING[2]:
-                return here, "stalled", tuple(costs)
+                return here, "stalled"
 
 
 def _held(evaluate: _Evaluator, here: _Linearised, free: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -130,6 +130,6 @@ def diagnose_evidence(
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
     return GapDiagnosis(
-        vehicle, detection, significance, uncalibrated, where, explanation, verdict, shrunk, following,
+        vehicle, detection, significance, uncalibrated, where, verdict, shrunk, following,
         drives, evidence, tuple(notes),
     )  # fmt: skip

@@ -9,7 +9,6 @@ from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.answer.where import GapCell
 from terrafusion.twin.gap.infer.detection import Detection
-from terrafusion.twin.gap.infer.explain import Explanation
 from terrafusion.twin.gap.null.drives import DriveCoverage
 from terrafusion.twin.gap.null.evidence import GapEvidence
 
@@ -26,7 +25,6 @@ class GapDiagnosis:
         significance: threshold of its p-value.
         uncalibrated: whether twin replicates stood in for references.
         where: cells of the gap map, most important first.
-        explanation: log evidence of sets of effects.
         verdict: causes and the judgement.
         shrinkage: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
@@ -40,7 +38,6 @@ class GapDiagnosis:
     significance: float
     uncalibrated: bool
     where: list[GapCell]
-    explanation: Explanation
     verdict: GapVerdict
     shrinkage: Shrinkage
     next_run: NextRun | None

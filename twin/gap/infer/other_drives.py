@@ -71,11 +71,6 @@ class RobotOffsets:
         mean, covariance, _ = _posterior(references, self.scatter, prior)
         return RobotOffsets(mean, covariance, self.scatter, prior, len(references))
 
-    def of(self, references: Sequence[Score]) -> RobotOffsets:
-        """What some references know, with the same scatter and prior."""
-        mean, covariance, _ = _posterior(references, self.scatter, self.prior)
-        return RobotOffsets(mean, covariance, self.scatter, self.prior, len(references), self.misfit)
-
     def left_out(self, references: Sequence[Score]) -> list[Array]:
         """Mean (P,) by all the references but each, with the same scatter and prior."""
         own, parts = 1.0 / self.scatter, list[tuple[Array, Array]]()

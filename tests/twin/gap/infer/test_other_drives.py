@@ -19,6 +19,7 @@ from terrafusion.twin.gap.infer.other_drives import (
     SCATTER_SCALES,
     RobotOffsets,
     _log_likelihood,
+    _posterior,
     learn_misfit,
     learn_offsets,
 )
@@ -304,8 +305,9 @@ def test_columns_that_act_alike_share_modestly_what_they_explain() -> None:
     """With a wide prior two columns that all but cancel are large; what they explain together stays."""
     pair = np.array([[1.0, -0.9999], [-0.9999, 1.0]]) * 400.0
     references = [Score(pair @ np.array([12.0, 10.0]), pair)] * 6
-    scatter = np.full(2, 0.01)
-    wide = RobotOffsets(np.zeros(2), np.eye(2), scatter, np.full(2, 400.0), 6).of(references)
+    scatter, prior = np.full(2, 0.01), np.full(2, 400.0)
+    mean, covariance, _ = _posterior(references, scatter, prior)
+    wide = RobotOffsets(mean, covariance, scatter, prior, 6)
     modest = wide.modest(references)
     assert np.abs(modest.mean).max() < 0.5 * np.abs(wide.mean).max()
     assert pair @ modest.mean == pytest.approx(pair @ wide.mean, rel=0.1)
