@@ -144,22 +144,22 @@ def make_lanes(
     return out
 
 
-def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
-    """States (N, X) of each lane at every n-th sample of all its windows.
+def simulate_lanes(lanes: Sequence[Lane]) -> list[Array]:
+    """States (N, X) of each lane at all samples of its windows.
 
-    Lanes of several logs run together between places where a window of one of them begins or ends; all their
-    samples are stored, and the soil of none changes with time.
+    Lanes of several logs, whose soils do not change with time, run together between places where a window of
+    one of them begins or ends.
     """
     fleet = _fleet(lanes)
     x, spans = _initial_states(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
-    out = [np.empty((len(lane.log.samples(every)), len(STATES))) for lane in lanes]
+    out = [np.empty((len(lane.log.samples()), len(STATES))) for lane in lanes]
     row, pose = [0] * len(lanes), [INDEX[name] for name in POSE]
     borders = np.unique(np.concatenate([span.ravel() for span in spans]))
     for p, q in itertools.pairwise(borders.tolist()):
         live = [i for i, span in enumerate(spans) if span[-1, 1] > p]
         if len(live) < len(fleet.plants):
             fleet = _fleet([lanes[i] for i in live])
-        count = (q - p) // every + 1
+        count = q - p + 1
         parts, inputs = list[Array](), list[Array]()
         for i in live:
             k = int(np.searchsorted(spans[i][:, 0], p, side="right")) - 1
@@ -168,10 +168,10 @@ def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
                 part[0] = x[i]
                 part[0, pose] = lanes[i].start[k]
             parts.append(part)
-            inputs.append(lanes[i].inputs[first : first + (count - 1) * every + 1])
+            inputs.append(lanes[i].inputs[first : first + count])
             row[i] += count if q == spans[i][k, 1] else count - 1
             x[i] = part[-1]  # a view, filled by `fleet.drive`
-        fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S, every)
+        fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S)
     for states in out:
         blank_what_diverged(states[None])
     return out

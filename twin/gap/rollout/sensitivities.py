@@ -210,15 +210,13 @@ def linearise(
 def linearise_all(courses: Sequence[Course], candidates: Candidates) -> list[Linearisation | None]:
     """Each as if alone, None where its run diverges; the runs of all are simulated together."""
     driven: list[dict[str, _Driven]] = [{} for _ in courses]
-    effects, several = [course.effects(candidates) for course in courses], len(courses) > 1
+    effects = [course.effects(candidates) for course in courses]
     for group in effect_groups(candidates):
         pairs = [(i, k) for i, some in enumerate(effects) for k in group if k in some]
         given = [(courses[i].log, courses[i].model, effects[i][k], courses[i].start) for i, k in pairs]
-        lanes, every = make_lanes(given, candidates, group), several or NOMINAL in group
-        # Runs of several logs are stopped where a window of any of them ends: between coarse samples, too.
-        states = simulate_lanes(lanes, 1 if every else COARSE_STEP) if lanes else []
-        for (i, k), lane, x in zip(pairs, lanes, states, strict=True):
-            coarse = x[coarse_subset(lane.log)] if every else x
+        lanes = make_lanes(given, candidates, group)
+        for (i, k), lane, x in zip(pairs, lanes, simulate_lanes(lanes) if lanes else (), strict=True):
+            coarse = x[coarse_subset(lane.log)]
             driven[i][k] = _Driven(lane, coarse, group, x if k == NOMINAL else None)
     return [_linearisation(*own, candidates) for own in zip(courses, effects, driven, strict=True)]
 
