@@ -24,6 +24,7 @@ from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 from terrafusion.twin.model.vehicle import VehicleParams
 
 SIGNIFICANCE = 0.05
@@ -50,7 +51,9 @@ class _Fit:
         self.model, self.candidates, self.channels = model, candidates, channels
         self.keys, self.scale = candidates.keys, candidates.scale
         self.low, self.high = candidates.bounds(range(len(self.keys)))
-        self.noise = dict.fromkeys(channels, ResidualNoise(1.0))  # white, in that of the data sheets
+        self.noise = ChannelNoise(
+            dict.fromkeys(channels, ResidualNoise(1.0))
+        )  # white, in that of the data sheets
 
     def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> WhitenedRun:
         """A log against the twin with parameters x, the pose at each window's start projected out."""

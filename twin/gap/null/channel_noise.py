@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,9 +31,9 @@ ANY_SIZE = 30.0  # 1 sigma of effects of any size, and of functions of the comma
 LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet (assumed)
 
 
-def data_sheet_noise(runs: Sequence[RunResiduals]) -> dict[str, ResidualNoise]:
+def data_sheet_noise(runs: Sequence[RunResiduals]) -> ChannelNoise:
     """Noise of the data sheets' sigma and correlation, by channel."""
-    out, lags = dict[str, ResidualNoise](), _lags(runs)
+    out, lags = ChannelNoise({}), _lags(runs)
     for channel in dict.fromkeys(o.channel for run in runs for o in run.log.observed):
         rho = _sheet_correlation(runs, channel, lags[channel]) or (1.0,)
         out[channel] = ResidualNoise(1.0, rho)
@@ -58,7 +58,7 @@ def learn_noise(
     """
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
-    noise = before or ChannelNoise(data_sheet_noise(every))
+    noise = before or data_sheet_noise(every)
     sigma, lags = initial_state_sigma(candidates), _lags(every)
     for _ in range(1 if before else 2):
         now, series = noise, dict[str, Series]()
@@ -68,7 +68,7 @@ def learn_noise(
             for channel, pairs in _series(run, now, gains, rest).items():
                 series.setdefault(channel, []).extend(pairs)
         found = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
-        noise = ChannelNoise.of(found, gains)
+        noise = ChannelNoise(found, gains)
     return noise
 
 
@@ -105,9 +105,7 @@ def _channel_noise(
     )
 
 
-def _fit_residuals(
-    run: RunResiduals, noise: Mapping[str, ResidualNoise], sigma: Array, size: float
-) -> list[Array]:
+def _fit_residuals(run: RunResiduals, noise: ChannelNoise, sigma: Array, size: float) -> list[Array]:
     """Residuals of one run after a fit of its states, effects (1 sigma `size`) and poses, one array (n,) a
     channel, zero outside the windows."""
     white = whitened(run.without_nuisance(), noise)
@@ -118,7 +116,7 @@ def _fit_residuals(
 
 
 def _series(
-    run: RunResiduals, noise: Mapping[str, ResidualNoise], gains: SharedGains, rest: Sequence[Array]
+    run: RunResiduals, noise: ChannelNoise, gains: SharedGains, rest: Sequence[Array]
 ) -> dict[str, Series]:
     """Residuals without the errors that channels share, in units of the data sheets' sigma, by channel and
     window."""

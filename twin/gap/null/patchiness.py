@@ -9,16 +9,16 @@ scatter hold the rest.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import ANY_SIZE
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun, whitened_columns
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 
 FACTORS = np.append(0.0, np.geomspace(0.05, 3.0, 35))
 """1 sigma of patches that are tried, in that of `PATCH_SIGMAS`. No ground varies as much as the last: where
@@ -37,7 +37,7 @@ def with_patches(
     runs: Sequence[RunResiduals],
     white: Sequence[WhitenedRun],
     references: int,
-    noise: Mapping[str, ResidualNoise],
+    noise: ChannelNoise,
     sigma: Array,
     jobs: int = 1,
 ) -> tuple[list[WhitenedRun], Array]:
@@ -62,9 +62,7 @@ def with_patches(
     return [*in_threads(jobs, _patched, white[:count], parts, more), *white[count:]], factors
 
 
-def _by_window(
-    run: RunResiduals, white: WhitenedRun, noise: Mapping[str, ResidualNoise]
-) -> list[tuple[Indices, Array]]:
+def _by_window(run: RunResiduals, white: WhitenedRun, noise: ChannelNoise) -> list[tuple[Indices, Array]]:
     """Samples of each window, and the whitened columns (n, D) of its patches without the poses."""
     columns, out = white.without_poses(whitened_columns(run.log, noise, run.by_patch)), []
     for k in np.unique(white.window):

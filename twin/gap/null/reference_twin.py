@@ -18,7 +18,6 @@ from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
 from terrafusion.twin.engine.stability import stable_steps
@@ -35,6 +34,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened_error,
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 
 RUNS = 3  # references that are used
 NUMBERS = (
@@ -83,7 +83,7 @@ class _Fit:
     """The fit of numbers w (K,), in scales, to runs about the given model."""
 
     cache: LinearisationCache
-    noise: dict[str, ResidualNoise]
+    noise: ChannelNoise
     numbers: Sequence[Coordinate]
     runs: Sequence[WhitenedRun]
     jobs: int

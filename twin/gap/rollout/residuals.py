@@ -8,7 +8,7 @@ start of each window. Poses are projected out; theta stays, and its variance is 
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -31,7 +31,7 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     linearise,
     moved_to,
 )
-from terrafusion.twin.gap.rollout.shared_errors import gains_of, with_shared, without_shared
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise, with_shared, without_shared
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 
@@ -327,10 +327,10 @@ def noise_sigma(observed: Observed, noise: ResidualNoise) -> Array:
     return np.hypot(observed.sigma, observed.timing / noise.scale)
 
 
-def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], columns: Sequence[Array]) -> Array:
+def whitened_columns(log: PreparedLog, noise: ChannelNoise, columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, given one array a channel, in units and axes in which the noise is
     white."""
-    columns = without_shared(log, gains_of(noise), columns)
+    columns = without_shared(log, noise.gains, columns)
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
     sigma = [noise_sigma(o, noise[o.channel]) for o in log.observed]
     for i, rows, places in sample_map(log).equally_spaced:
@@ -341,7 +341,7 @@ def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], colum
     return out
 
 
-def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Array) -> Array:
+def physical_error(run: WhitenedRun, noise: ChannelNoise, error: Array) -> Array:
     """A whitened error (n,) in the units of the channels."""
     error, out = run.with_patches(error), np.empty(len(error))
     sigma = [noise_sigma(o, noise[o.channel]) for o in run.log.observed]
@@ -350,11 +350,11 @@ def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: 
         out[places] = noise[observed.channel].unwhiten_alike(
             observed.slot[rows[0]], sigma[i][rows], error[places]
         )
-    whole = with_shared(run.log, gains_of(noise), [c[:, None] for c in by_channel(run.log, out)])
+    whole = with_shared(run.log, noise.gains, [c[:, None] for c in by_channel(run.log, out)])
     return np.concatenate([whole[i][rows, 0] for i, _, rows in sample_map(run.log).blocks])
 
 
-def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:
+def whitened(run: RunResiduals, noise: ChannelNoise) -> WhitenedRun:
     """The run in units and axes in which its noise is white, with the poses projected out."""
     both = [np.column_stack(parts) for parts in zip(run.columns, run.error, strict=True)]
     white = whitened_columns(run.log, noise, both)
@@ -384,9 +384,7 @@ def _orthonormal(columns: Array) -> Array:
     return out
 
 
-def whitened_error(
-    run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Sequence[Array], clip: bool = True
-) -> Array:
+def whitened_error(run: WhitenedRun, noise: ChannelNoise, error: Sequence[Array], clip: bool = True) -> Array:
     """Another error of the run, one array a channel, whitened (n,), poses projected out, outliers clipped."""
     out = run.without_poses(whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0])
     out = run.without_patches(out)

@@ -13,7 +13,6 @@ from typing import Self
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, Candidates
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.rollout.residuals import (
@@ -26,6 +25,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     whitened_error,
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 
 MOST_SOIL = 4.0  # limit of a soil, in typical sizes from the model's (assumed)
 LIMIT_SIGMAS = 3.0
@@ -60,7 +60,7 @@ class SoilSearch:
     going: bool = True
 
     @classmethod
-    def of(cls, run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> Self:
+    def of(cls, run: RunResiduals, noise: ChannelNoise) -> Self:
         """From the model's soil on."""
         white = whitened(run.without_nuisance(), noise)
         return cls(white, run.soil, run.error, white.error)
@@ -75,9 +75,7 @@ class SoilSearch:
         gain = self.run.rows[:, :-1].astype(float).T @ self.white_error
         return np.asarray(self.share * np.linalg.solve(H, gain[mine])[:S])
 
-    def accept_if_better(
-        self, soil: Array, predicted: Sequence[Array] | None, noise: Mapping[str, ResidualNoise]
-    ) -> None:
+    def accept_if_better(self, soil: Array, predicted: Sequence[Array] | None, noise: ChannelNoise) -> None:
         """Goes to a soil where its prediction is better, one array a channel."""
         if predicted is not None:
             error = self.run.residuals.errors_of(predicted)
@@ -94,7 +92,7 @@ class SoilSearch:
 def at_run_soil(
     runs: Sequence[RunResiduals],
     cache: LinearisationCache,
-    noise: Mapping[str, ResidualNoise],
+    noise: ChannelNoise,
     limit: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> list[RunResiduals]:

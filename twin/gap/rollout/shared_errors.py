@@ -9,9 +9,9 @@ errors and sensitivities keep all they say; where wheels have noise of their own
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,7 +21,6 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.observations import Observed
-from terrafusion.twin.gap.data.samples import Indices
 
 GRID_S = 0.1  # interval at which errors are integrated
 LEAST_EXPLAINED = 0.1
@@ -47,178 +46,119 @@ class SharedGains:
 
 
 class ChannelNoise(dict[str, ResidualNoise]):
-    """Noise by channel, of what is left without the shared errors."""
+    """Noise by channel, of what is left without the shared errors of these gains."""
 
-    gains: SharedGains = SharedGains()
-
-    @classmethod
-    def of(cls, channels: dict[str, ResidualNoise], gains: SharedGains) -> ChannelNoise:
-        """With these gains."""
-        out = cls(channels)
-        out.gains = gains
-        return out
+    def __init__(self, channels: Mapping[str, ResidualNoise], gains: SharedGains | None = None) -> None:
+        super().__init__(channels)
+        self.gains = gains or SharedGains()
 
 
-def gains_of(noise: Mapping[str, ResidualNoise]) -> SharedGains:
-    """Those of the noise; none where it has none."""
-    return noise.gains if isinstance(noise, ChannelNoise) else SharedGains()
+_CACHE: WeakKeyDictionary[PreparedLog, dict[str, Any]] = WeakKeyDictionary()
 
 
-@dataclass(frozen=True, eq=False)
-class _Weights:
-    """Linear interpolation of n samples at m places."""
-
-    low: Indices
-    high: Indices
-    share: Array
-
-    @classmethod
-    def of(cls, known_s: Array, at_s: Array) -> Self:
-        place = np.interp(at_s, known_s, np.arange(float(len(known_s))))
-        low = np.minimum(place.astype(np.int64), max(len(known_s) - 2, 0))
-        return cls(low, np.minimum(low + 1, len(known_s) - 1), place - low)
-
-    def __call__(self, values: Array) -> Array:
-        """Values (n, k) at the places, (m, k)."""
-        share = self.share[:, None]
-        return np.asarray((1.0 - share) * values[self.low] + share * values[self.high])
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Times (N,) every `GRID_S` in a log's windows: `window` (N,) of each, `first` (W,) of each window."""
-
-    t_s: Array
-    window: Indices
-    first: Indices
-
-    @classmethod
-    def of(cls, log: PreparedLog) -> Self:
-        begin_s, end_s = (log.windows * DT_S).T
-        counts = np.maximum(np.round((end_s - begin_s) / GRID_S).astype(np.int64), 1)
-        window, first = np.repeat(np.arange(len(counts)), counts), np.cumsum(counts) - counts
-        return cls(begin_s[window] + GRID_S * (np.arange(len(window)) - first[window] + 0.5), window, first)
-
-    def integral(self, rates: Array) -> Array:
-        """Integral (N, k) of rates (N, k) in each window."""
-        total = np.cumsum(GRID_S * rates, axis=0) - 0.5 * GRID_S * rates
-        return np.asarray(total - total[self.first[self.window]])
-
-    def centred_integral(self, rates: Array) -> Array:
-        """The same less its mean in each window, which the window's pose holds."""
-        total = self.integral(rates)
-        counts = np.diff(np.append(self.first, len(total)))
-        means = np.add.reduceat(total, self.first) / counts[:, None]
-        return np.asarray(total - means[self.window])
-
-
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """What a log tells of its motion.
-
-    Attributes:
-        along, across: (N, 2) unit vector of the heading, and its normal times the wheels' speed, rad/s, east
-            and north, on the grid.
-        wheels, gyro: interpolation at the grid; `turns` that of the wheels at the gyro's samples.
-        fixes: by channel, interpolation of the grid at its samples.
-    """
-
-    grid: _Grid
-    along: Array
-    across: Array
-    wheels: list[_Weights]
-    gyro: _Weights
-    turns: list[_Weights]
-    fixes: dict[str, _Weights]
-
-
-_CACHE: WeakKeyDictionary[PreparedLog, _Motion | None] = WeakKeyDictionary()
-
-
-def _motion(log: PreparedLog) -> _Motion | None:
-    """Computed once a log; None where wheels of both sides or gyro are missing."""
+def _maps(log: PreparedLog) -> dict[str, Any]:
+    """By gain, the sparse matrix (M, M) that gives what wheels and gyro show of the samples of all channels,
+    for a gain of one; computed once a log, empty where wheels of both sides or gyro are missing."""
     if log not in _CACHE:
-        _CACHE[log] = _motion_of(log)
+        complete = {*WHEELS, GYRO} <= {o.channel for o in log.observed}
+        _CACHE[log] = _maps_of(log) if complete else {}
     return _CACHE[log]
 
 
-def _motion_of(log: PreparedLog) -> _Motion | None:
+def _maps_of(log: PreparedLog) -> dict[str, Any]:
+    from scipy import sparse
+
+    values = np.concatenate([o.value for o in log.observed])
+    every = sparse.identity(len(values), format="csr")
+    ends = [*_ends(log), len(values)]
+    own = {o.channel: every[end - len(o.value) : end] for o, end in zip(log.observed, ends, strict=True)}
     by = {o.channel: o for o in log.observed}
-    if not {*WHEELS, GYRO} <= set(by):
-        return None
-    grid, gyro_s = _Grid.of(log), _middle_s(by[GYRO])
-    gyro = _Weights.of(gyro_s, grid.t_s)
-    wheels = [_Weights.of(_middle_s(by[name]), grid.t_s) for name in WHEELS]
-    turns = [_Weights.of(_middle_s(by[name]), gyro_s) for name in WHEELS]
-    yaw = log.start[grid.window, 2] + grid.integral(gyro(by[GYRO].value[:, None]))[:, 0]
-    speed = 0.5 * sum(w(by[name].value[:, None]) for w, name in zip(wheels, WHEELS, strict=True))
-    along = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    across = speed * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    fixes = {name: _Weights.of(grid.t_s, by[name].end_s) for pair in FIXES for name in pair if name in by}
-    return _Motion(grid, along, across, wheels, gyro, turns, fixes)
+
+    def read(channel: str, at_s: Array) -> Any:
+        return _interpolation(_middle_s(by[channel]), at_s) @ own[channel]
+
+    begin_s, end_s = (log.windows * DT_S).T
+    counts = np.maximum(np.round((end_s - begin_s) / GRID_S).astype(np.int64), 1).tolist()
+    grid_s = np.concatenate([b + GRID_S * (np.arange(n) + 0.5) for b, n in zip(begin_s, counts, strict=True)])
+    in_windows = [_integral(n) for n in counts]
+    integral = sparse.block_diag(in_windows, format="csr")
+    # The window's pose holds the mean.
+    centred = sparse.block_diag([block - block.mean(axis=0) for block in in_windows], format="csr")
+    left, right, rate = (read(channel, grid_s) for channel in (*WHEELS, GYRO))
+    ahead, heading = 0.5 * (left + right), centred @ rate
+    speed, yaw = ahead @ values, np.repeat(log.start[:, 2], counts) + integral @ (rate @ values)
+    from_left, from_right = (read(channel, _middle_s(by[GYRO])) for channel in WHEELS)
+    maps = {"turn": own[GYRO].T @ (from_right - from_left), "advance": 0.0 * every, "course": 0.0 * every}
+    for pair, sums in zip(FIXES, (integral, sparse.identity(len(grid_s))), strict=True):
+        axes = (np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))
+        for channel, (along, across) in zip(pair, axes, strict=True):
+            if channel in by:
+                fixes = own[channel].T @ _interpolation(grid_s, by[channel].end_s) @ sums
+                maps["advance"] += fixes @ sparse.diags(along) @ ahead
+                maps["course"] += fixes @ sparse.diags(speed * across) @ heading
+    return maps
+
+
+def _interpolation(known_s: Array, at_s: Array) -> Any:
+    """Sparse matrix (m, n): linear interpolation of n samples at m times, constant beyond the ends."""
+    from scipy import sparse
+
+    place = np.interp(at_s, known_s, np.arange(float(len(known_s))))
+    low = np.minimum(place.astype(np.int64), max(len(known_s) - 2, 0))
+    columns = np.stack([low, np.minimum(low + 1, len(known_s) - 1)], axis=1)
+    weights = np.stack([1.0 - (place - low), place - low], axis=1)
+    rows = np.repeat(np.arange(len(at_s)), 2)
+    return sparse.csr_matrix((weights.ravel(), (rows, columns.ravel())), shape=(len(at_s), len(known_s)))
+
+
+def _integral(count: int) -> Array:
+    """Matrix (n, n): integral in time of rates every `GRID_S`, by trapezoids, from the first on."""
+    out = GRID_S * (np.tri(count) - 0.5 * np.eye(count))
+    out[:, 0] -= 0.5 * GRID_S
+    return np.asarray(out)
 
 
 def _middle_s(observed: Observed) -> Array:
     return np.asarray(0.5 * (observed.begin_s + observed.end_s))
 
 
-def _shares(log: PreparedLog, motion: _Motion, columns: Sequence[Array]) -> Iterator[tuple[int, str, Array]]:
-    """What wheels and gyro show of each channel, for gains of one: its number, the gain's name, (n, k)."""
-    number = {o.channel: i for i, o in enumerate(log.observed)}
-    left, right = (columns[number[name]] for name in WHEELS)
-    at_left, at_right = motion.turns
-    yield number[GYRO], "turn", at_right(right) - at_left(left)
-    ahead = 0.5 * (motion.wheels[0](left) + motion.wheels[1](right))
-    heading = motion.grid.centred_integral(motion.gyro(columns[number[GYRO]]))
-    for places, pair in zip((True, False), FIXES, strict=True):
-        for axis, name in enumerate(pair):
-            if name not in motion.fixes:
-                continue
-            for gain, speed in (
-                ("advance", motion.along[:, axis, None] * ahead),
-                ("course", motion.across[:, axis, None] * heading),
-            ):
-                moved = motion.grid.integral(speed) if places else speed
-                yield number[name], gain, motion.fixes[name](moved)
+def _ends(log: PreparedLog) -> list[int]:
+    """Where one channel ends and the next begins among the samples of all."""
+    return np.cumsum([len(o.value) for o in log.observed])[:-1].tolist()
 
 
 def without_shared(log: PreparedLog, gains: SharedGains, columns: Sequence[Array]) -> list[Array]:
     """Columns (n, k) of all channels, one array each, without what wheels and gyro show of them."""
-    out, motion = list(columns), _motion(log)
-    if motion is None or gains == SharedGains():
-        return out
-    for channel, gain, share in _shares(log, motion, columns):
-        out[channel] = out[channel] - getattr(gains, gain) * share
-    return out
+    maps = _maps(log) if gains != SharedGains() else {}
+    if not maps:
+        return list(columns)
+    whole = np.concatenate(columns)
+    shown = sum(gain * (maps[name] @ whole) for name, gain in vars(gains).items())
+    return np.split(whole - shown, _ends(log))
 
 
 def with_shared(log: PreparedLog, gains: SharedGains, columns: Sequence[Array]) -> list[Array]:
     """The columns (n, k) that `without_shared` made these of."""
-    out, motion = list(columns), _motion(log)
-    if motion is None or gains == SharedGains():
-        return out
-    turned = next(iter(_shares(log, motion, out)))
-    out[turned[0]] = out[turned[0]] + gains.turn * turned[2]
-    for channel, gain, share in _shares(log, motion, list(out)):
-        if gain != "turn":
-            out[channel] = out[channel] + getattr(gains, gain) * share
-    return out
+    maps = _maps(log) if gains != SharedGains() else {}
+    if not maps:
+        return list(columns)
+    whole = np.concatenate(columns)
+    whole = whole + gains.turn * (maps["turn"] @ whole)  # the gyro's, which the fixes' need
+    shown = gains.advance * (maps["advance"] @ whole) + gains.course * (maps["course"] @ whole)
+    return np.split(whole + shown, _ends(log))
 
 
 def learn_gains(errors: Iterable[tuple[PreparedLog, Sequence[Array]]]) -> SharedGains:
     """By least squares over errors of runs, one array (n,) a channel; poses of the windows take part."""
     turns, fixes = list[Array](), list[Array]()
     for log, own in errors:
-        motion, parts = _motion(log), dict[int, dict[str, Array]]()
-        columns = [e[:, None] for e in own]
-        for channel, gain, share in () if motion is None else _shares(log, motion, columns):
-            parts.setdefault(channel, {})[gain] = share[:, 0]
-        for channel, shares in parts.items():
-            table = np.column_stack([*shares.values(), own[channel]])
-            if "turn" in shares:
-                turns.append(table)
-            elif log.observed[channel].channel in FIXES[0]:
-                fixes.append(_without_trend(table, log.observed[channel], log))
+        maps, whole = _maps(log), np.concatenate(own)
+        table = np.column_stack([*(shown @ whole for shown in maps.values()), whole])
+        for observed, rows in zip(log.observed, np.split(table, _ends(log)) if maps else (), strict=False):
+            if observed.channel == GYRO:
+                turns.append(rows[:, [0, -1]])
+            elif observed.channel in FIXES[0]:
+                fixes.append(_without_trend(rows[:, 1:], observed, log))
     turn, by_fixes = _gains(turns, 1), _gains(fixes, 2)
     return SharedGains(turn[0], *by_fixes)
 

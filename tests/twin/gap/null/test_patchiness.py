@@ -24,6 +24,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     run_residuals,
     whitened,
 )
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import DRIVE, run
@@ -53,9 +54,9 @@ def drawn(of: RunResiduals, seed: int, patches: float, effect: float) -> RunResi
 
 
 @pytest.fixture(scope="module")
-def noise(residuals: RunResiduals) -> dict[str, ResidualNoise]:
+def noise(residuals: RunResiduals) -> ChannelNoise:
     """White, of the data sheets' size."""
-    return {channel: ResidualNoise(1.0, (1.0,)) for channel in data_sheet_noise([residuals])}
+    return ChannelNoise({channel: ResidualNoise(1.0, (1.0,)) for channel in data_sheet_noise([residuals])})
 
 
 def test_the_size_of_patches_is_estimated_whatever_the_effect(residuals, noise) -> None:
