@@ -51,9 +51,8 @@ class _Fit:
         self.model, self.candidates, self.channels = model, candidates, channels
         self.keys, self.scale = candidates.keys, candidates.scale
         self.low, self.high = candidates.bounds(range(len(self.keys)))
-        self.noise = ChannelNoise(
-            dict.fromkeys(channels, ResidualNoise(1.0))
-        )  # white, in that of the data sheets
+        # White, in that of the data sheets.
+        self.noise = ChannelNoise(dict.fromkeys(channels, ResidualNoise(1.0)))
 
     def of(self, log: PreparedLog, x: Array, derivatives: bool = True) -> WhitenedRun:
         """A log against the twin with parameters x, the pose at each window's start projected out."""

@@ -52,7 +52,7 @@ def sample_map(log: PreparedLog) -> SampleMap:
 
 
 def with_observed(log: PreparedLog, observed: Sequence[Observed]) -> PreparedLog:
-    """The log with other values or sigmas of its samples, whose times are the same."""
+    """The log with other sigmas of its samples."""
     out = dataclasses.replace(log, observed=tuple(observed))
     _CACHE[out] = sample_map(log)
     return out

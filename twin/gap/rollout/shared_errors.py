@@ -21,6 +21,7 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.observations import Observed
+from terrafusion.twin.gap.data.samples import SampleMap, sample_map
 
 GRID_S = 0.1  # interval at which errors are integrated
 LEAST_EXPLAINED = 0.1
@@ -53,16 +54,17 @@ class ChannelNoise(dict[str, ResidualNoise]):
         self.gains = gains or SharedGains()
 
 
-_CACHE: WeakKeyDictionary[PreparedLog, dict[str, Any]] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[SampleMap, dict[str, Any]] = WeakKeyDictionary()
 
 
 def _maps(log: PreparedLog) -> dict[str, Any]:
     """By gain, the sparse matrix (M, M) that gives what wheels and gyro show of the samples of all channels,
     for a gain of one; computed once a log, empty where wheels of both sides or gyro are missing."""
-    if log not in _CACHE:
+    at = sample_map(log)
+    if at not in _CACHE:
         complete = {*WHEELS, GYRO} <= {o.channel for o in log.observed}
-        _CACHE[log] = _maps_of(log) if complete else {}
-    return _CACHE[log]
+        _CACHE[at] = _maps_of(log) if complete else {}
+    return _CACHE[at]
 
 
 def _maps_of(log: PreparedLog) -> dict[str, Any]:
