@@ -102,7 +102,8 @@ def estimator_gap(
     groups = [scores(references), scores(runs), scores(twins({})), []]
     fit = found.verdict.fit
     if fit is not None:
-        groups[-1] = scores(twins(found.evidence.candidates.changed(fit.columns, fit.value)))
+        effects = found.evidence.candidates.changed(fit.columns, np.concatenate(fit.values))
+        groups[-1] = scores(twins(effects))
     names = dict.fromkeys(name for group in groups for one in group for name in one)
     return [Compared(name, *(_mean(group, name) for group in groups)) for name in names], failed
 

@@ -126,7 +126,7 @@ def diagnose_evidence(
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
     if limited or evidence.patchier is not None:
         verdict = verdict.withheld_on_unseen_drives(detection.p_value <= STRICTER * significance)
-    shrunk = shrinkage(judged, sigma, robot, verdict.fit)
+    shrunk = shrinkage(judged, sigma, robot, verdict.fit, explanation.left_out)
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
     return GapDiagnosis(

@@ -21,7 +21,7 @@ from terrafusion.fusion.benchmark.estimator_gap import (
 from terrafusion.fusion.reports.gap import judge_rows
 from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.answer.verdict import EffectFit
+from terrafusion.twin.gap.infer.single_effects import Fitted
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import run
@@ -64,7 +64,7 @@ def test_the_twin_of_a_run_turns_its_wheels_alike_and_lacks_what_the_log_lacks(
     assert np.abs(speeds(made) - speeds(recording)).mean() < 0.05
 
 
-def fake(found_fit: EffectFit | None, driven: tuple[Recording, PreparedLog]) -> SimpleNamespace:
+def fake(found_fit: Fitted | None, driven: tuple[Recording, PreparedLog]) -> SimpleNamespace:
     evidence = SimpleNamespace(model=MODEL, runs=[SimpleNamespace(log=driven[1])])
     return SimpleNamespace(evidence=evidence, verdict=SimpleNamespace(fit=found_fit))
 

@@ -5,15 +5,15 @@ one left out, with theta and poses fitted anew in both arms. A single run is sco
 interval.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.gap.answer.verdict import EffectFit
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
+from terrafusion.twin.gap.infer.single_effects import Fitted
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
@@ -21,6 +21,9 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 METRIC = "mean squared whitened error with soil, offsets and pose adapted, on runs left out of the fit"
 ABOVE_FLOOR = 3.0  # standard deviations of the floor (assumed) above which a gap has a share
 FREE = 10.0  # factor on theta's 1 sigma where it alone is recalibrated (assumed: nearly free)
+
+
+LeftOut = Callable[[Fitted], list[tuple[Array, ...]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +57,13 @@ def own_error(run: WhitenedRun, robot: RobotOffsets) -> Array:
     return run.error - run.by_parameter @ robot.mean
 
 
-def shrinkage(evidence: GapEvidence, sigma: Array, robot: RobotOffsets, fit: EffectFit | None) -> Shrinkage:
-    """Shrinkage by fitted effects; zero without any."""
+def shrinkage(
+    evidence: GapEvidence, sigma: Array, robot: RobotOffsets, fit: Fitted | None, left_out: LeftOut
+) -> Shrinkage:
+    """Shrinkage by fitted effects; zero without any. `left_out` is that of the explanation."""
     runs, references = evidence.runs, evidence.references
     was = [own_error(run, robot) for run in runs]
-    now = _errors_left_out(evidence, robot, fit, was)
+    now = was if fit is None else _errors_left_out(evidence, robot, fit, left_out(fit), was)
     free = [_mean_square(r.without_states(FREE * sigma, e)) for r, e in zip(runs, was, strict=True)]
     arms = [
         [(r, r.without_states(sigma, e)) for r, e in zip(some, errors, strict=True)]
@@ -102,13 +107,11 @@ def _by_channel(
 
 
 def _errors_left_out(
-    evidence: GapEvidence, robot: RobotOffsets, fit: EffectFit | None, was: list[Array]
+    evidence: GapEvidence, robot: RobotOffsets, fit: Fitted, values: list[tuple[Array, ...]], was: list[Array]
 ) -> list[Array]:
-    """Errors of each run with the effect fitted to the other runs."""
-    if fit is None:
-        return was
-    changed, values = evidence.candidates.changed, enumerate(fit.left_out)
-    tried = [RunWithEffects(i, changed(fit.columns, value)) for i, value in values]
+    """Errors of each run with the effect at its values fitted to the other runs."""
+    changed = evidence.candidates.changed
+    tried = [RunWithEffects(i, changed(fit.columns, np.concatenate(x))) for i, x in enumerate(values)]
     errors = zip(evidence.runs, whitened_errors(evidence, tried), was, strict=True)
     return [before if e is None else e - run.by_parameter @ robot.mean for run, e, before in errors]
 

@@ -55,15 +55,6 @@ class CredibleSet:
 
 
 @dataclass(frozen=True, eq=False)
-class EffectFit:
-    """The effects found: columns and values (k,), typical sizes, and the values fitted without each run."""
-
-    columns: tuple[int, ...]
-    value: Array
-    left_out: list[Array]
-
-
-@dataclass(frozen=True, eq=False)
 class GapVerdict:
     """The verdict, its named effects, all causes and credible sets, the most probable first; `fit` is that of
     the named effects, `log_odds` those of any effect against none."""
@@ -74,7 +65,7 @@ class GapVerdict:
     sets: list[CredibleSet]
     p_null: float
     p_unknown: float
-    fit: EffectFit | None
+    fit: Fitted | None
     log_odds: float = 0.0
 
     def ambiguous(self) -> Cause | None:
@@ -128,7 +119,7 @@ def judge(
     likely = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
     kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
-    return GapVerdict(kind, named, causes, credible, p_null, p_unknown, _fit(found, found.fits[best]), odds)
+    return GapVerdict(kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds)
 
 
 def most_probable(sets: Mapping[Sets, float]) -> Sets:
@@ -208,9 +199,3 @@ def _sigma(
     motion = {*candidates.moving, *DELAYS}
     law = [head.law_motion if candidates.keys[i] in motion else head.law_sensor for i in columns]
     return np.hypot(np.sqrt(np.diag(covariance)), law * np.abs(value))
-
-
-def _fit(found: Explanation, fit: Fitted) -> EffectFit:
-    columns = tuple(i for law in fit.laws for i in law.columns)
-    left_out = [np.concatenate(values) for values in found.left_out(fit)]
-    return EffectFit(columns, np.concatenate(fit.values), left_out)

@@ -34,11 +34,6 @@ class Rate:
         return {"hits": self.hits, "count": self.count, "rate": self.value, "low": low, "high": high}
 
 
-def rate(outcomes: Sequence[bool]) -> Rate:
-    """The share of outcomes that are true."""
-    return Rate(sum(bool(o) for o in outcomes), len(outcomes))
-
-
 @dataclass(frozen=True)
 class Reliability:
     """Stated confidence against outcome.
@@ -51,24 +46,16 @@ class Reliability:
     ece: float | None
     brier: float | None
     count: int
-    bins: tuple[tuple[float, float, int], ...]
-
-    def to_json(self) -> dict[str, object]:
-        return {
-            "ece": self.ece,
-            "brier": self.brier,
-            "count": self.count,
-            "bins": [list(b) for b in self.bins],
-        }
+    bins: list[list[float]]
 
 
 def reliability(confidence: Sequence[float], outcomes: Sequence[bool]) -> Reliability:
     """In `BINS` bins of equal width."""
     if not confidence:
-        return Reliability(None, None, 0, ())
+        return Reliability(None, None, 0, [])
     p, y = np.asarray(confidence, dtype=float), np.asarray(outcomes, dtype=float)
     which = np.minimum((p * BINS).astype(int), BINS - 1)
     groups = [which == b for b in range(BINS) if (which == b).any()]
-    bins = tuple((float(p[g].mean()), float(y[g].mean()), int(g.sum())) for g in groups)
+    bins = [[float(p[g].mean()), float(y[g].mean()), int(g.sum())] for g in groups]
     ece = sum(count * abs(stated - true) for stated, true, count in bins) / len(p)
     return Reliability(float(ece), float(np.mean((p - y) ** 2)), len(p), bins)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from terrafusion.twin.gap.blind.answers import DIAGNOSIS
 from terrafusion.twin.gap.blind.headline import headline
 from terrafusion.twin.gap.blind.plan import D_PRIMES, FAMILIES, HARDER, OTHER_DRIVES, PLAIN, Trial
-from terrafusion.twin.gap.blind.rates import rate, reliability
+from terrafusion.twin.gap.blind.rates import Rate, reliability
 from terrafusion.twin.gap.blind.shapes import shapes
 from terrafusion.twin.gap.blind.verdicts import judge
 
@@ -89,7 +89,7 @@ def _figures(t: pd.DataFrame, oracle: Mapping[str, float]) -> dict[str, Any]:
         },
         "class_size": {f: _mean(some.class_size[some["first"].notna()]) for f, some in by_family.items()},
         "confidence": {
-            family: reliability(some.confidence.tolist(), some.top1.tolist()).to_json()
+            family: vars(reliability(some.confidence.tolist(), some.top1.tolist()))
             for family, some in by_family.items()
         },
         "unknown": {"recall": _rate(outside.unknown), "false": _rate(seen.unknown)},
@@ -104,7 +104,7 @@ def _figures(t: pd.DataFrame, oracle: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _rate(outcomes: pd.Series) -> dict[str, Any]:
-    return rate(outcomes.tolist()).to_json()
+    return Rate(int(outcomes.sum()), len(outcomes)).to_json()
 
 
 def _mean(values: pd.Series) -> float | None:

@@ -9,10 +9,12 @@ references know of a column travels to any drive, and what they do not know coun
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.null.score import Score
@@ -90,24 +92,26 @@ def learn_offsets(
         scales: factors of the prior scatter to choose from; replicates of the twin, which has none, show
             nothing of it.
     """
-    found = [_learn(references, candidates, scale) for scale in scales]
+    column = np.arange(len(references[0].b))
+    first = np.where(column < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER)
+    group = np.maximum(column - candidates, -1) // len(BASIS)
+    groups = [group == k for k in np.unique(group)]
+    prior = np.ones(len(column))
+    found = [_learn(references, (scale * first) ** 2, prior, EM_STEPS, groups) for scale in scales]
     return max(found, key=lambda o: _log_likelihood(references, o.scatter, o.prior))
 
 
-def _learn(references: Sequence[Score], candidates: int, scale: float) -> RobotOffsets:
-    """With the prior scatter times a factor."""
-    P, count = len(references[0].b), len(references)
-    first = (scale * np.where(np.arange(P) < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER)) ** 2
-    group = np.maximum(np.arange(P) - candidates, -1) // len(BASIS)
-    scatter, prior = first, np.ones(P)
-    mean, covariance = np.zeros(P), np.eye(P)
-    for _ in range(EM_STEPS):
+def _learn(
+    references: Sequence[Score], first: Array, prior: Array, steps: int, groups: Sequence[NDArray[np.bool_]]
+) -> RobotOffsets:
+    """By expectation-maximisation from a scatter `first` (P,) on; the prior variance is learned for each of
+    some groups of columns (P,)."""
+    scatter, count, prior = first, len(references), prior.copy()
+    for _ in range(steps):
         mean, covariance, square = _posterior(references, scatter, prior)
         scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + count)
         own = mean**2 + np.diag(covariance)
-        prior = prior.copy()
-        for k in np.unique(group):
-            mine = group == k
+        for mine in groups:
             prior[mine] = max((PRIOR_COLUMNS + own[mine].sum()) / (PRIOR_COLUMNS + mine.sum()), 1.0)
     return RobotOffsets(mean, covariance, scatter, prior, count)
 
@@ -141,13 +145,10 @@ def learn_misfit(
     """
     count = len(references[0].b) - len(offsets.mean)
     first = np.append(offsets.scatter, np.full(count, MISFIT_SCATTER**2))
-    prior, scatter = np.append(offsets.prior, np.full(count, sigma**2)), first
-    mean, covariance = np.zeros(len(first)), np.eye(len(first))
-    for _ in range(MISFIT_STEPS):
-        mean, covariance, square = _posterior(references, scatter, prior)
-        scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + len(references))
-    covariance = covariance + np.diag(changed)
-    return RobotOffsets(mean, covariance, scatter, prior, len(references), count, changed)
+    prior = np.append(offsets.prior, np.full(count, sigma**2))
+    found = _learn(references, first, prior, MISFIT_STEPS, ())
+    covariance = found.covariance + np.diag(changed)
+    return dataclasses.replace(found, covariance=covariance, misfit=count, changed=changed)
 
 
 def _posterior(references: Sequence[Score], scatter: Array, prior: Array) -> tuple[Array, Array, Array]:

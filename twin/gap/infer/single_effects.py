@@ -46,6 +46,11 @@ class Fitted:
     evidence: float
     covariance: tuple[Array, ...]
 
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Of all laws, one after the other."""
+        return tuple(i for law in self.laws for i in law.columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Laws:
