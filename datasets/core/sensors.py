@@ -30,6 +30,8 @@ ASSUMED_VELOCITY_SIGMA_MPS = 0.5
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
 """Sigma of each horizontal axis by class of fix, where neither log nor vehicle gives it; up has twice that.
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
+COARSER = 3.0
+"""A receiver whose data sheet has so many times the sigma of a class made no such fix (assumed)."""
 CLASS_SIGMA_M = np.array([ASSUMED_SIGMA_M[fix] for fix in Fix])
 """The same by the number of the class."""
 
@@ -201,8 +203,8 @@ def assumed_sigma(
     """Sigmas (N, 3) of fixes that report none, and where they are from.
 
     The vehicle's sigma is that of the best class of fix in the log; a poorer one has at least the sigma
-    `ASSUMED_SIGMA_M` of its class. A receiver coarser than the best class did not make these fixes: then all
-    have the sigma of their class.
+    `ASSUMED_SIGMA_M` of its class. A receiver far coarser than the best class did not make these fixes: then
+    all have the sigma of their class.
 
     Args:
         fix: (N,) classes.
@@ -210,7 +212,7 @@ def assumed_sigma(
     """
     spec, flat = rig.sensors.gnss if rig else None, CLASS_SIGMA_M[fix]
     best = CLASS_SIGMA_M[fix if every is None else every].min()
-    if spec is None or spec.sigma_horizontal_m > best:
+    if spec is None or spec.sigma_horizontal_m > COARSER * best:
         return _by_class(flat), f"assumed by class, flat: {_classes(fix)}"
     poorer = flat > best
     own = np.array([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m])

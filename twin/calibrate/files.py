@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.twin.calibrate.identifiability import IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration, FittedParameter
@@ -85,8 +86,8 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
     """Numbers that the log itself gave replace those of the file."""
     for name, entry in list(raw.items()):
         value = getattr(values, name, None)
-        if not isinstance(entry, dict) or value is None:
-            continue
+        if not isinstance(entry, dict) or value is None or isinstance(value, KnownNumber):
+            continue  # what is known of a sensor comes from the file itself
         if "value" not in entry:
             _overridden(entry, value)
         elif entry["value"] != (plain := list(value) if isinstance(value, tuple) else value):

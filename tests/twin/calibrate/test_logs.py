@@ -175,3 +175,13 @@ def test_a_published_soil_is_written_too(tmp_path) -> None:
     (name,) = found.model.soils
     write_files(found, tmp_path, "elevate", {name: soil})
     assert load_soil(tmp_path / "soil.yaml") == found.model.soils[name]
+
+
+def test_a_vehicle_file_of_the_short_form_keeps_what_it_knows_of_the_sensors(tmp_path) -> None:
+    short = tmp_path / "mine.yaml"
+    known = "{value: 0.01, known: calibrated, sigma: 0.003, logs: [monday]}"
+    short.write_text(f"robot:\n  extends: elevate\n  name: mine\n  gyro_scale: {known}\n")
+    found = calibrate(drive(), short, SOIL, NAMES)
+    write_files(found, tmp_path, short)
+    assert load_vehicle(tmp_path / "vehicle.yaml") == found.model.vehicle
+    assert found.model.vehicle.robot.gyro_scale == load_vehicle(short).robot.gyro_scale
