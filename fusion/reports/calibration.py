@@ -64,8 +64,10 @@ def _verdict(c: Calibration) -> VerdictBox:
     reasons += [f"{d.sentence}." for d in c.identifiability.weak]
     if not c.converged():
         return VerdictBox("not_to_be_used", "Not to be used: the search did not converge", reasons)
+    misfits = [sentence for channel in c.channels if (sentence := channel.misfit()) is not None]
+    reasons += misfits
     known = len(c.fitted) - len(c.unidentified())
-    value = "doubtful" if edges or c.unidentified() else "good"
+    value = "doubtful" if edges or c.unidentified() or misfits else "good"
     return VerdictBox(value, f"{known} of {len(c.fitted)} parameters are identified", reasons)
 
 

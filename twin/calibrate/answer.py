@@ -15,9 +15,6 @@ from terrafusion.twin.calibrate.problem import Problem, ResidualBlock
 from terrafusion.twin.calibrate.result import Calibration, ChannelFit, FittedParameter
 from terrafusion.twin.calibrate.solver import OUTCOMES, Solution
 
-MISFIT = 5.0
-"""A channel whose residuals exceed this many times its noise is reported (assumed)."""
-
 
 def answer_of(
     problem: Problem, solution: Solution, covariance: Array, identified: Identifiability, notes: Sequence[str]
@@ -42,11 +39,13 @@ def answer_of(
         }
         for i, log in enumerate(problem.logs)
     }
+    channels = channel_fits(problem, solution)
+    misfits = [sentence for channel in channels if (sentence := channel.misfit()) is not None]
     return Calibration(
         tuple(fitted), cov / np.outer(sigma, sigma), cov * np.outer(rate, rate), identified,
-        _marked(problem.model_at(point.w), fitted), problem.model, channel_fits(problem, solution), errors,
+        _marked(problem.model_at(point.w), fitted), problem.model, channels, errors,
         solution.outcome, OUTCOMES[solution.outcome], solution.runs, problem.seconds(),
-        (*notes, *_misfits(problem, solution), *_assumptions(problem)),
+        (*notes, *misfits, *_assumptions(problem)),
     )  # fmt: skip
 
 
@@ -67,7 +66,7 @@ def channel_fits(problem: Problem, solution: Solution) -> tuple[ChannelFit, ...]
                 log.name, observed.channel, 0.5 * (observed.begin_s + observed.end_s)[rows], measured,
                 measured + old, measured + residual, noise.scale * float(np.median(observed.sigma)),
                 noise.rho[1] if len(noise.rho) > 1 else 0.0, _lag_one(white),
-                float(np.mean(np.abs(np.concatenate(white)) > 4.0)),
+                float(np.mean(np.abs(np.concatenate(white)) > 4.0)), noise.scale,
             )
         )  # fmt: skip
     return tuple(fits)
@@ -110,15 +109,6 @@ def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) ->
         c.name, c.unit, c.value(w), c.rate(w) * sigma, c.value(w - 2.0 * sigma), c.value(w + 2.0 * sigma),
         c.start, c.prior, c.rate(0.0), status, ratio, w <= low + 1e-9 or w >= high - 1e-9,
     )  # fmt: skip
-
-
-def _misfits(problem: Problem, solution: Solution) -> list[str]:
-    return [
-        f"{problem.logs[i].name}: {problem.logs[i].observed[k].channel} is off by {noise.scale:.0f} times "
-        "its noise: is it the right vehicle, ground, slope, load and frame?"
-        for (i, k), noise in solution.noise.items()
-        if noise.scale > MISFIT
-    ]
 
 
 def _assumptions(problem: Problem) -> list[str]:

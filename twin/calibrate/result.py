@@ -12,6 +12,8 @@ from terrafusion.twin.calibrate.model import Model
 SCHEMA = "terrafusion.calibration/1"
 CONVERGED = ("converged", "at_bound")
 """Outcomes of a search that converged."""
+MISFIT = 5.0
+"""Noise of a channel over that of its data sheet, from which the twin does not fit (assumed)."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class ChannelFit:
         correlation: autocorrelation of neighbouring rows.
         left: the same of whitened rows, about zero if the noise model holds.
         outliers: share of whitened rows beyond 4.
+        noise_ratio: the noise over that of the data sheet.
     """
 
     log: str
@@ -66,6 +69,16 @@ class ChannelFit:
     correlation: float
     left: float
     outliers: float
+    noise_ratio: float
+
+    def misfit(self) -> str | None:
+        """A sentence where the twin does not fit the channel."""
+        if self.noise_ratio <= MISFIT:
+            return None
+        return (
+            f"{self.log}: {self.channel} is off by {self.noise_ratio:.0f} times its noise: is it the right "
+            "vehicle, ground, slope, load and frame?"
+        )
 
     def rms(self, series: Array) -> float:
         """Root mean square of a series (n,) less what was measured."""

@@ -105,3 +105,16 @@ def test_no_such_log(terrafusion, tmp_path: Path) -> None:
 )
 def test_wrong_usage(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
     assert terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).status == 2
+
+
+def test_a_twin_that_does_not_fit_is_doubtful(terrafusion, good_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fit"
+    names = "vehicle.body.mass_kg"
+    done = terrafusion(
+        "calibrate", f"{good_log}@0-12", "--vehicle", "husky", "--parameters", names, "--out", out
+    )
+    assert done.status == 0, done.err
+    assert "times its noise: is it the right vehicle" in done.out
+    page = (out / "report.html").read_text()
+    assert "times its noise: is it the right vehicle" in page.partition("<strong>1 of 1 parameters")[2]
+    assert "doubtful" in page.partition("<strong>1 of 1 parameters")[0].lower()[-600:]

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.api.replays import replay
 from terrafusion.fusion.metrics.scores import Outage
@@ -78,7 +79,10 @@ def start_of(run: Recording, receiver: str, warm_s: float) -> Start | None:
         return None
     _, path_m = ekf.run(streams, lambda t: warm_s <= t < warm_s + OUTAGE_S)
     theirs = streams.error_m(streams.t_s, path_m, warm_s, OUTAGE_S)
-    result = replay(run, mode="fixed", outages=[Outage(warm_s, OUTAGE_S)])
+    try:
+        result = replay(run, mode="fixed", outages=[Outage(warm_s, OUTAGE_S)])
+    except TerrafusionError:  # nothing shows where the robot is
+        return None
     errors, (outage,) = result.scores.errors, result.scores.outages
     if errors is None or theirs is None or outage.end_error_m is None:
         return None
