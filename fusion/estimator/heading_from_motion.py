@@ -132,11 +132,11 @@ def heading_from_motion(
     body = origin + ahead_m * np.exp(1j * yaw)
     heights = np.array([f.enu_m[2] for f in inside])
     height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
-    by_numbers = (pull @ path.by_numbers(t_fix)).imag / abs(turn)
+    stuck, shown = abs(turn) < LEAST_RATIO * information, max(abs(turn), LEAST_RATIO * information)
+    by_numbers = (pull @ path.by_numbers(t_fix)).imag / shown
     by_delay = _turned_by_delay(path, pull, t_fix, float(np.sqrt(doubt.numbers[GNSS_DELAY, GNSS_DELAY])))
-    stuck = abs(turn) < LEAST_RATIO * information
     # Fixes that move further than the wheels do not show the heading better.
-    random = UNKNOWN_YAW_RAD if stuck else off * variance**0.5 / min(abs(turn), information)
+    random = UNKNOWN_YAW_RAD if stuck else off * variance**0.5 / min(shown, information)
     sigma_rad = float(np.sqrt(random**2 + by_delay**2 + by_numbers @ doubt.numbers @ by_numbers))
     sigma_rad = min(sigma_rad, UNKNOWN_YAW_RAD)
     mean_m = off * np.sqrt(max(mean_variance, float(((mean_of * sigma_m) ** 2).sum())))
