@@ -259,7 +259,7 @@ def _run_estimator(
         return _run_estimator(drive, batch, None, watch, found)
     alignment_notes = history.align(estimator.gnss.alignment, batch)
     if archive is not None and history.states:
-        history.smooth(archive, estimator.config, estimator.gnss.alignment is not None, estimator.learned)
+        history.smooth(archive, estimator.config, estimator.gnss, estimator.learned)
     seconds = time.perf_counter() - started
     if not history.states:
         raise never_started(drive.given, drive.config.rig.wheel_radius_m)

@@ -37,7 +37,7 @@ from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
-from terrafusion.fusion.estimator.place_doubt import PlaceDoubt, rounded
+from terrafusion.fusion.estimator.place_doubt import PlaceDoubt
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
@@ -440,7 +440,7 @@ class Estimator:
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._reported_covariance, gyro, gyro_sigma),
         )
-        self._state = rounded(self.gnss.plausible.widened(state, self.gnss.track.reach_m))
+        self._state = self.gnss.widened(state)
         if not self._silent:
             call_back(self._on_state, self._state)
         return self._state

@@ -13,13 +13,15 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
-from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.estimate.estimate import Innovation, State
+from terrafusion.fusion.estimator.alignment import KnownStart
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE, DriftWatch
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
 from terrafusion.fusion.estimator.fix_velocity import FixVelocities
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
-from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
+from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map, turn_window
+from terrafusion.fusion.estimator.place_doubt import OpenHeading, rounded
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
@@ -61,8 +63,8 @@ class GnssUpdater:
 
     Attributes:
         waiting: fixes not yet used, oldest first.
-        local: the graph was started without GNSS, or without a clear heading at a known place, and is not yet
-            aligned with the map. `placed_ns`: newest fix that gave that place, or -1; it takes later ones.
+        local: the graph was started without GNSS, or with an `open_heading` at a known place, and is not yet
+            aligned with the map.
         alignment: with the map, once known; unaligned: how many fixes came until then.
         velocities: their velocities.
         rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
@@ -102,7 +104,8 @@ class GnssUpdater:
         # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
-        self.local, self.placed_ns = False, -1
+        self.local = False
+        self.open_heading: OpenHeading | None = None
         self.alignment: MapAlignment | None = None
         self._local_fixes: list[GnssFix] = []
         self.unaligned = 0
@@ -166,11 +169,19 @@ class GnssUpdater:
     @property
     def unplaced(self) -> bool:
         """Whether the path is local from its first position on."""
-        return self.local and self.placed_ns < 0
+        return self.local and self.open_heading is None
 
-    def place(self) -> None:
-        """Begin a local path at the place that the waiting fixes gave, without a clear heading."""
-        self.local, self.placed_ns = True, self.waiting[-1].t_ns
+    def place(self, start: KnownStart) -> None:
+        """Begin a local path at the place that the waiting fixes gave, with an open heading."""
+        self.local = True
+        self.open_heading = OpenHeading(start.position_m, start.yaw_sigma_rad, self.waiting[-1].t_ns)
+
+    def widened(self, state: State) -> State:
+        """A state with the doubt of implausible fixes and of an open heading."""
+        state = self.plausible.widened(state, self.track.reach_m)
+        if self.local and self.open_heading is not None:
+            state = self.open_heading.widened(state)
+        return rounded(state)
 
     def update(self, chain: Chain, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
@@ -190,7 +201,8 @@ class GnssUpdater:
                 self.unaligned += 1
                 self.track.add(fix)
                 self._local_fixes += [fix] if chain.archive is not None else []
-                used |= fix.t_ns > self.placed_ns and self._align(chain, fix, noise)
+                known = self.open_heading is not None and fix.t_ns <= self.open_heading.until_ns
+                used |= not known and self._align(chain, fix, noise)
             elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:
@@ -330,19 +342,11 @@ class GnssUpdater:
         k = chain.at_or_after(fix.t_ns)
         if k is None:
             return False
-        chain.smooth(len(chain.nodes))
-        pose = chain.state(k).pose
-        antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
-        off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
-        # All that the wrong heading may have bent is in doubt again.
         doubt = np.zeros(chain.dim)
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
-        doubt[3:6] = off**2 + (fix.horizontal_sigma_m * self.scale) ** 2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
         doubt[SLIP], doubt[DRIFT] = noise.slip_sigma**2, self.drift_sigma_m**2
-        chain.restart(doubt, chain.first)
-        chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
-        chain.smooth(len(chain.nodes))
+        turn_window(chain, k, fix, turn, self.antenna_m, self.scale, doubt)
         self.track.restart()
         self.skid.restart()
         self.turned += 1

@@ -11,10 +11,11 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate, Innovation, State, WeightChange
+from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import key_state_of, smoothed
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.map_alignment import MapAlignment
-from terrafusion.fusion.estimator.place_doubt import widened_smoothed
+from terrafusion.fusion.estimator.place_doubt import rounded, widened_smoothed
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
@@ -58,11 +59,13 @@ class History:
         note += f"{np.degrees(alignment.yaw_rad):.0f} degrees"
         return (note if batch else f"{note}; live, all before was in a local frame: it is not scored",)
 
-    def smooth(self, archive: Chain, config: EstimatorConfig, aligned: bool, learned: LearnedNumbers) -> None:
+    def smooth(
+        self, archive: Chain, config: EstimatorConfig, gnss: GnssUpdater, learned: LearnedNumbers
+    ) -> None:
         """Replace the live states by the batch solution over the whole run, which starts from them.
 
-        Where fixes have `aligned` the path with the map, no state of it is local any more. The covariances
-        hold what is not known of antenna and delay of the fixes at the end.
+        Where fixes have aligned the path with the map, no state of it is local any more. The covariances hold
+        what is not known of antenna and delay of the fixes at the end.
         """
         live = [key_state_of(state) for state in self.states]
         batch = BatchSmoother(archive, live)
@@ -78,11 +81,13 @@ class History:
         pairs = zip(self.noises, apart_s, strict=True)
         sigma_radps = np.array([gyro_sigma_radps(imu, dt_s, noise) for noise, dt_s in pairs])
         self.states = smoothed(self.states, live, keys[offset:], covariances, sigma_radps)
-        if aligned:
+        if gnss.alignment is not None:
             self.states = [
                 dataclasses.replace(state, status="outage") if state.status == "no_gnss" else state
                 for state in self.states
             ]
+        elif gnss.open_heading is not None:
+            self.states = [rounded(gnss.open_heading.widened(state)) for state in self.states]
 
     def estimate(
         self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]

@@ -98,6 +98,24 @@ def align_to_map(
     return alignment
 
 
+def turn_window(
+    chain: Chain, k: int, fix: GnssFix, turn_rad: float, antenna_m: Array, scale: float, doubt: Array
+) -> None:
+    """Turn the whole window, whose heading was wrong, and shift the antenna at keyframe k to a fix.
+
+    All that the wrong heading may have bent is in `doubt` (dim,) again, variances, and the place by how far
+    it moves and by the fix, sigma times `scale`.
+    """
+    chain.smooth(len(chain.nodes))
+    pose = chain.state(k).pose
+    antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ antenna_m
+    off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
+    doubt[3:6] = off**2 + (fix.horizontal_sigma_m * scale) ** 2
+    chain.restart(doubt, chain.first)
+    chain.turn(turn_rad, antenna, np.append(fix.enu_m[:2], antenna[2]))
+    chain.smooth(len(chain.nodes))
+
+
 def drop_local_factors(nodes: list[Node]) -> None:
     """Drop headings and heights of aiding sensors in a local frame.
 

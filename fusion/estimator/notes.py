@@ -12,7 +12,7 @@ from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
-    if gnss.placed_ns >= 0:
+    if gnss.open_heading is not None:
         then = "later fixes showed it" if gnss.alignment is not None else "no later fixes showed it"
         notes.append(
             f"the first fixes ended before they showed the heading clearly: it was open at first; {then}"

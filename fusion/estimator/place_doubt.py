@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,6 +67,29 @@ class PlaceDoubt:
         out = P.copy()
         out[POSE, POSE] += (J * moments) @ J.T
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class OpenHeading:
+    """A local path that begins at a known place with a heading that is known to `sigma_rad` only.
+
+    The graph holds the path in a frame of its own: an unknown turn of all of it is not linear. `until_ns` is
+    the newest fix that gave the place.
+    """
+
+    place_m: Array
+    sigma_rad: float
+    until_ns: int
+
+    def widened(self, state: State) -> State:
+        """A state of that frame with the doubt of the turn about the place."""
+        x_m, y_m = (state.position_m[:2] - self.place_m[:2]).tolist()
+        by_turn = np.array([-y_m, x_m, 0.0, 0.0, 0.0, 1.0])
+        covariance = state.covariance + self.sigma_rad**2 * np.outer(by_turn, by_turn)
+        east, north, _ = state.velocity_mps.tolist()
+        across = self.sigma_rad * np.array([-north, east, 0.0])
+        velocity = state.velocity_covariance + np.outer(across, across)
+        return dataclasses.replace(state, covariance=covariance, velocity_covariance=velocity)
 
 
 def rounded(state: State) -> State:

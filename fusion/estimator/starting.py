@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -85,8 +87,9 @@ class StartSearch:
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
                 return rough.start
             if rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD or len(fixes) >= MANY_FIXES:
-                self._gnss.place()
-                self.known = rough.alone()
+                start = rough.alone()
+                self._gnss.place(start)
+                self.known = dataclasses.replace(start, yaw_sigma_rad=self.level.yaw_sigma_rad)
                 return self.known.at(self.level)
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
             self._gnss.local = True

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.estimator.place_doubt import HEADING_TIME_S, PlaceDoubt
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.place_doubt import HEADING_TIME_S, OpenHeading, PlaceDoubt, rounded
 from terrafusion.fusion.graph.key_state import DIM, LINEAR, KeyState
 from terrafusion.fusion.replay import ReplayResult, replay
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 
 SPEED_MPS, DELAY_S, STEP_NS = 2.0, 0.1, 10**8
@@ -100,3 +104,22 @@ def test_fixes_on_time_stay_sharp(on_time: Recording) -> None:
     assert result.estimate.trajectory.covariance is not None
     assert np.sqrt(result.estimate.trajectory.covariance[-1, :2, :2].trace()) < 0.04
     assert 0.7 < 0.5 * squares(result).mean() < 1.4
+
+
+def test_an_open_heading_turns_the_path_about_its_place() -> None:
+    """The covariance of a turn by 1 sigma; where it is large, a circle that holds it for any turn."""
+    states: list[State] = []
+    estimator = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate"), on_state=states.append)
+    for message in simulate("straight", terrain="asphalt", seed=1).messages():
+        estimator.add(message)
+    state, place = states[-1], states[0].position_m
+    away = state.position_m - place
+    for sigma_rad in (0.05, 1.8):
+        wider = OpenHeading(place, sigma_rad, 0).widened(state)
+        more = wider.covariance - state.covariance
+        assert more[5, 5] == pytest.approx(sigma_rad**2)
+        assert more[:2, :2] @ away[:2] == pytest.approx([0.0, 0.0], abs=1e-9)
+        assert more[:2, :2].trace() == pytest.approx(sigma_rad**2 * float(away[:2] @ away[:2]))
+        circle = rounded(wider).covariance
+        assert np.linalg.eigvalsh(circle).min() >= -1e-12
+        assert (circle[0, 0] == circle[1, 1]) == (sigma_rad > 0.8)
