@@ -131,4 +131,4 @@ def test_a_part_of_a_log_begins_later() -> None:
     assert cut.start_ns == whole.start_ns + 3_000_000_000
     assert cut.wheels is not None
     assert (np.diff(cut.wheels.t_ns) > 0).all()
-    assert cut.duration_s() <= 4.0
+    assert cut.wheels.t_ns[-1] - cut.start_ns <= 4_000_000_000

@@ -51,7 +51,7 @@ class Start:
 
 
 def part(recording: Recording, begin_s: float, seconds: float) -> Recording:
-    """A recording that begins later and ends after so long."""
+    """A recording that begins later and ends after so long; its truth stays whole."""
     begin_ns = recording.start_ns + round(begin_s * 1e9)
     end_ns = begin_ns + round(seconds * 1e9)
     channels: dict[str, Any] = {
