@@ -30,7 +30,7 @@ UNIT_ERROR = 0.1
 FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
 LARGEST_WHEEL_M = 0.5
-"""Radius up to which a robot's wheels are expected."""
+"""Radius up to which a robot's wheels are expected (assumed)."""
 STEEPEST = 0.05
 """Mean descent above which a robot may roll faster than its braked wheels."""
 YAW_WINDOW_S, LEAST_YAW_WINDOWS, LEAST_YAW_R = 4.0, 12, 0.95

@@ -201,8 +201,8 @@ class GnssUpdater:
                 self.unaligned += 1
                 self.track.add(fix)
                 self._local_fixes += [fix] if chain.archive is not None else []
-                known = self.open_heading is not None and fix.t_ns <= self.open_heading.until_ns
-                used |= not known and self._align(chain, fix, noise)
+                gave_place = self.open_heading is not None and fix.t_ns <= self.open_heading.until_ns
+                used |= not gave_place and self._align(chain, fix, noise)
             elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:

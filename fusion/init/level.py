@@ -21,7 +21,8 @@ LEAST_SIGMA_RAD = math.radians(0.5)
 SEEN_SIGMAS, LEAST_TILT_RAD = 3.0, math.radians(2.0)
 """A tilt is corrected from so many sigma on, and no less than this."""
 FORWARD_SIGMA_RAD = 0.4
-"""1 sigma of the IMU's angle about z where acceleration shows that it is not turned by a quarter."""
+"""1 sigma of the IMU's angle about z where acceleration shows that it is not turned by a quarter
+(assumed)."""
 MOST_ALONG = 0.4
 """Headings cover the circle where their mean direction is no longer than this; 1 is a straight drive."""
 
