@@ -41,9 +41,10 @@ from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import Explanation, explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
+from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import gather_evidence
-from terrafusion.twin.gap.null.score import learn_state_sigma, score
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario

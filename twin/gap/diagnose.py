@@ -23,9 +23,10 @@ from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import FEWEST, SCATTER_SCALES, learn_offsets
+from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.null.score import learn_state_sigma, replicates, score
+from terrafusion.twin.gap.null.score import replicates, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams

@@ -92,13 +92,25 @@ def learn_offsets(
         scales: factors of the prior scatter to choose from; replicates of the twin, which has none, show
             nothing of it.
     """
-    column = np.arange(len(references[0].b))
-    first = np.where(column < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER)
-    group = np.maximum(column - candidates, -1) // len(BASIS)
+    first = _first_scatter(len(references[0].b), candidates)
+    group = np.maximum(np.arange(len(first)) - candidates, -1) // len(BASIS)
     groups = [group == k for k in np.unique(group)]
-    prior = np.ones(len(column))
-    found = [_learn(references, (scale * first) ** 2, prior, EM_STEPS, groups) for scale in scales]
+    prior = np.ones(len(first))
+    found = [_learn(references, scale**2 * first, prior, EM_STEPS, groups) for scale in scales]
     return max(found, key=lambda o: _log_likelihood(references, o.scatter, o.prior))
+
+
+def first_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
+    """From references with the prior variances; arguments as those of `learn_offsets`."""
+    scatter = _first_scatter(len(references[0].b), candidates)
+    prior = np.ones(len(scatter))
+    mean, covariance, _ = _posterior(references, scatter, prior)
+    return RobotOffsets(mean, covariance, scatter, prior, len(references))
+
+
+def _first_scatter(columns: int, candidates: int) -> Array:
+    """Prior variance (P,) from run to run."""
+    return np.where(np.arange(columns) < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER) ** 2
 
 
 def _learn(

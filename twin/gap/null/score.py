@@ -15,9 +15,6 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
-EM_STEPS = 6
-PRIOR_RUNS = 3.0  # weight of the assumed variance of theta, in runs (assumed)
-LEAST_SIGMA = 0.03  # least 1 sigma of theta, as a share of its unit (assumed)
 REPLICATES = 20  # twin replicates that stand in for references
 
 
@@ -51,23 +48,3 @@ def replicates(templates: Sequence[WhitenedRun], sigma: Array, offset: Array | f
     information = [score(run, sigma).A for run in templates]
     every = itertools.islice(itertools.cycle(information), REPLICATES)
     return [Score((A * offset).sum(axis=1), A) for A in every]
-
-
-def learn_state_sigma(runs: Sequence[WhitenedRun], first: Array) -> Array:
-    """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al.
-    1977)."""
-    sigma = first.copy()
-    if len(runs) < 2:
-        return sigma
-    T = runs[0].states
-    for _ in range(EM_STEPS):
-        means, spreads = [], []
-        for run in runs:
-            H = np.linalg.inv(run.state_information(sigma))
-            means.append(H @ run.gram[:T, -1])
-            spreads.append(np.diag(H))
-        centred = np.array(means) - np.mean(means, axis=0)
-        observed = (centred**2).sum(axis=0) + (len(runs) - 1) / len(runs) * np.sum(spreads, axis=0)
-        variance = (PRIOR_RUNS * first**2 + observed) / (PRIOR_RUNS + len(runs) - 1)
-        sigma = np.maximum(np.sqrt(variance), LEAST_SIGMA * first)
-    return sigma

@@ -9,8 +9,9 @@ from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.infer.bank import DELAYED, SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.explain import _Explainer
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
+from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.null.score import learn_state_sigma, score
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs

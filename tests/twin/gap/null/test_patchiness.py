@@ -13,10 +13,11 @@ from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.other_drives import learn_offsets
+from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null import evidence as gathering
 from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
 from terrafusion.twin.gap.null.patchiness import LEAST_RATIO, patchier, with_patches
-from terrafusion.twin.gap.null.score import learn_state_sigma, score
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
     RunResiduals,
