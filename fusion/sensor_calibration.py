@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.fusion.calibration.fit import information_gained
 from terrafusion.fusion.calibration.mounting import Angle
 from terrafusion.fusion.calibration.numbers import (

@@ -91,13 +91,10 @@ def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:
     return dataclasses.replace(recording, **{channel: changed})
 
 
-def changed(part: str, change: Callable[..., Any], **given: Any) -> Repair:
-    """A repair that replaces a channel, or another field of a recording, by what `change` makes of it.
-
-    `given` are further arguments of `change`.
-    """
+def changed(channel: str, change: Callable[..., Any], **given: Any) -> Repair:
+    """A repair that replaces a channel by what `change` makes of it and of the arguments `given`."""
     return lambda recording: dataclasses.replace(
-        recording, **{part: change(getattr(recording, part), **given)}
+        recording, **{channel: change(getattr(recording, channel), **given)}
     )
 
 
@@ -106,12 +103,9 @@ def changed_field(channel: str, field: str, change: Callable[[Array], Array]) ->
     return changed(channel, lambda old: dataclasses.replace(old, **{field: change(getattr(old, field))}))
 
 
-def scaled(channel: str, factor: float, *fields: str) -> Repair:
-    """A repair that multiplies fields of a channel."""
-    return changed(
-        channel,
-        lambda old: dataclasses.replace(old, **{name: getattr(old, name) * factor for name in fields}),
-    )
+def scaled(channel: str, factor: float, field: str) -> Repair:
+    """A repair that multiplies a field of a channel."""
+    return changed_field(channel, field, lambda values: values * factor)
 
 
 def without_rows(channel: str, rows: Mask) -> Repair:

@@ -110,20 +110,16 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
     if mean is None or is_metric(mean):
         return
     size = float(np.linalg.norm(mean))
+    code, what = "accel-magnitude", f"mean specific force is {size:.2f} m/s2, not 9.8"
+    fix, repair = "give raw accelerometer data in m/s2, gravity included", None
     if 0.85 < size < 1.15:
-        what, fix = "acceleration looks like g, not m/s2", f"multiply by {GRAVITY_MPS2}"
-        repair = scaled("imu", GRAVITY_MPS2, "accel_mps2")
-        yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
-        return
-    what = f"mean specific force is {size:.2f} m/s2, not 9.8"
-    fix = "give raw accelerometer data in m/s2, gravity included"
-    if size < REMOVED_SHARE * GRAVITY_MPS2:
+        code, what = "accel-in-g", "acceleration looks like g, not m/s2"
+        fix, repair = f"multiply by {GRAVITY_MPS2}", scaled("imu", GRAVITY_MPS2, "accel_mps2")
+    elif size < REMOVED_SHARE * GRAVITY_MPS2:
         what += ": gravity has been removed"
         fix = f"leave the accelerometer out (better: {fix})"
         repair = changed_field("imu", "accel_mps2", lambda accel: np.full_like(accel, np.nan))
-        yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix, repair)
-        return
-    yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix)
+    yield Finding(code, "error", "imu", what, _mean_force(mean), fix, repair)
 
 
 def check_bias(context: CheckContext) -> Iterator[Finding]:
@@ -370,12 +366,8 @@ def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repa
     turning = turning_axis(context)
     alone = turning == "+z"  # the gyro is right as it is: the accelerometer has other axes
     if alone and up == "-z":
-        return (
-            "; gyro z turns with the wheels",
-            "change the sign of the specific force",
-            scaled("imu", -1.0, "accel_mps2"),
-            (),
-        )
+        evidence, fix = "; gyro z turns with the wheels", "change the sign of the specific force"
+        return evidence, fix, scaled("imu", -1.0, "accel_mps2"), ()
     axes, evidence = _axes_for(context, imu, up, alone)
     if turning is not None:
         evidence = f"; the gyro turns with the wheels about {turning}{evidence}"

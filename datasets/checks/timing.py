@@ -10,7 +10,6 @@ import numpy as np
 from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
-    Repair,
     changed,
     clocks_of,
     counted,
@@ -18,9 +17,10 @@ from terrafusion.datasets.checks.finding import (
     retimed,
     retiming,
 )
-from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Channel
-from terrafusion.datasets.core.recording import ClockJump, Recording
+from terrafusion.datasets.core.conventions import numbers_of, true_updates
+from terrafusion.datasets.core.recording import Recording
 
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
 """Channels that are sampled evenly; terrain labels are not."""
@@ -61,19 +61,14 @@ def check_spans(context: CheckContext) -> Iterator[Finding]:
         "let it start with the others: they last equally long; correlation finds the remaining offset"
         if alike
         else "bring the channels onto one clock; their durations differ, so the offset is unknown",
-        _moved(outlier, begins - int(own[0])) if alike else None,
+        functools.partial(_moved, name=outlier, by_ns=begins - int(own[0])) if alike else None,
     )  # fmt: skip
 
 
-def _moved(name: str, by_ns: int) -> Repair:
-    def repair(recording: Recording) -> Recording:
-        moved = retimed(recording, name, getattr(recording, name).t_ns + by_ns)
-        first_ns = min(int(t[0]) for t in clocks_of(moved).values())
-        return dataclasses.replace(
-            moved, start_ns=max(first_ns, moved.start_ns) if by_ns > 0 else moved.start_ns
-        )
-
-    return repair
+def _moved(recording: Recording, name: str, by_ns: int) -> Recording:
+    moved = retimed(recording, name, getattr(recording, name).t_ns + by_ns)
+    first_ns = min(int(t[0]) for t in clocks_of(moved).values())
+    return dataclasses.replace(moved, start_ns=max(first_ns, moved.start_ns)) if by_ns > 0 else moved
 
 
 def check_steps(context: CheckContext) -> Iterator[Finding]:
@@ -87,12 +82,13 @@ def check_steps(context: CheckContext) -> Iterator[Finding]:
             f"its clock was set {counted(len(own), 'time')}",
             f"largest step {worst.step_s:+.3f} s at t = {context.since_start_s(np.int64(worst.t_ns)):.2f} s",
             "keep the times as repaired on reading: good to a sampling period",
-            changed("clock_jumps", _without_those_of, channel=name),
+            functools.partial(_with_jumps_accepted, channel=name),
         )  # fmt: skip
 
 
-def _without_those_of(jumps: tuple[ClockJump, ...], channel: str) -> tuple[ClockJump, ...]:
-    return tuple(jump for jump in jumps if jump.channel != channel)
+def _with_jumps_accepted(recording: Recording, channel: str) -> Recording:
+    others = tuple(jump for jump in recording.clock_jumps if jump.channel != channel)
+    return dataclasses.replace(recording, clock_jumps=others)
 
 
 def check_coarse(context: CheckContext) -> Iterator[Finding]:
@@ -134,16 +130,10 @@ def coarse_tick_s(channel: Channel) -> float:
     if not uneven or tick < 0.6 * mean:
         return 0.0
     residual = (channel.t_ns - _even(channel.t_ns, 3.0 * tick)) * 1e-9
-    twice = (dt == 0.0) & _same_rows(channel)
+    twice = (dt == 0.0) & ~true_updates(numbers_of(channel), len(channel))[1:]
     if residual.std() > 0.4 * tick or twice.sum() > 0.95 * max((dt == 0.0).sum(), 1):
         return 0.0
     return round(tick, 6)
-
-
-def _same_rows(channel: Channel) -> Mask:
-    """Whether each row but the first equals the one before."""
-    columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
-    return np.all([(v[1:] == v[:-1]) | (np.isnan(v[1:]) & np.isnan(v[:-1])) for v in columns], axis=0)
 
 
 def _even(t_ns: TimesNs, gap_s: float) -> TimesNs:

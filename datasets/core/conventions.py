@@ -159,7 +159,7 @@ def _true_updates(recording: Recording, c: Conventions) -> Recording:
         channel = getattr(recording, name)
         if channel is None or not len(channel):
             continue
-        values = _values(channel)
+        values = numbers_of(channel)
         keep = true_updates(values, round(rows))
         if keep.all() or not values.shape[1]:
             continue
@@ -177,7 +177,8 @@ def true_updates(values: Array, rows: int) -> Mask:
     return since_change % max(rows, 1) == 0
 
 
-def _values(channel: Channel | Trajectory) -> Array:
+def numbers_of(channel: Channel | Trajectory) -> Array:
+    """The numbers of a channel side by side, (N, k); of a trajectory its poses."""
     if isinstance(channel, Trajectory):
         return (
             channel.position_m

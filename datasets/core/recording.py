@@ -10,10 +10,11 @@ import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from terrafusion.datasets.core.display import CLOCK_COLUMNS, clock_line, clock_rows, table_html
 from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.quantity import Quantity, Whole
+from terrafusion.datasets.core.tables import CLOCK_COLUMNS, clock_line, clock_rows, table_html
 from terrafusion.datasets.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ class ClockJump:
     """
 
     channel: str
-    t_ns: int
-    step_s: float
+    t_ns: Annotated[int, Whole("", -(2.0**63), 2.0**63 - 1024, meaning="whole nanoseconds")]
+    step_s: Annotated[float, Quantity("s", -1e10, 1e10)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -15,7 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.clock import repaired_rows
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
-from terrafusion.datasets.core.recording import ClockJump, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, read_table
@@ -109,7 +109,7 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         truth_channels=contents,
         overrides=meta.overrides(),
         notes=(*meta.notes, *(note for note in notes if note not in meta.notes)),
-        clock_jumps=tuple(ClockJump(**vars(jump)) for jump in meta.clock_jumps),
+        clock_jumps=meta.clock_jumps,
     )
 
 

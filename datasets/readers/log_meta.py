@@ -14,7 +14,7 @@ from terrafusion.datasets.core.config import Prepared, structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
-from terrafusion.datasets.core.recording import Overrides
+from terrafusion.datasets.core.recording import ClockJump, Overrides
 from terrafusion.datasets.core.scratch import UNFINISHED
 from terrafusion.datasets.core.sensors import DRIVES
 
@@ -55,15 +55,6 @@ class DescriptionFile:
     truth_frame: Annotated[str, Word(("base", "antenna"))] = "base"
 
 
-@dataclass(frozen=True)
-class ClockJumpFile:
-    """A jump of a channel's clock that was repaired."""
-
-    channel: str
-    t_ns: Annotated[int, Whole("", -(2.0**63), 2.0**63 - 1024, meaning="whole nanoseconds")]
-    step_s: Annotated[float, Quantity("s", -1e10, 1e10)]
-
-
 def _listed(raw: Any) -> Any:
     return raw if isinstance(raw, (list, tuple)) else [raw]
 
@@ -77,7 +68,7 @@ class MetaFile(DescriptionFile):
         Whole("", 0, MAX_START_NS, meaning="the Unix time of t_s = 0 in whole nanoseconds (0 when unknown)"),
     ]
     notes: tuple[str, ...] = ()
-    clock_jumps: Annotated[tuple[ClockJumpFile, ...], Prepared(_listed, {"type": "object"})] = ()
+    clock_jumps: Annotated[tuple[ClockJump, ...], Prepared(_listed, {"type": "object"})] = ()
     keep_empty: Switch = False
 
 

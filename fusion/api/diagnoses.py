@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from terrafusion.datasets.core.display import text_html
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.reports.gap import write_diagnosis
 from terrafusion.fusion.reports.gap_text import answer

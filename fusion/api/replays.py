@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.display import text_html
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.grounds.file import read_grounds
 from terrafusion.fusion.grounds.memory import GroundMemory

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.frames import yaw_of
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.core.trajectory import Trajectory
 
 if TYPE_CHECKING:

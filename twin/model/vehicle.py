@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated
 
 from terrafusion.datasets.core.config import refuse, structure
-from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.quantity import Sourced, Word
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES, Rig, SensorSuite, SteeringSpec
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.sensor_realism import SensorRealism
 from terrafusion.twin.model.vehicle_file import read_vehicle
