@@ -100,17 +100,14 @@ def read_table(path: Path, known: ChannelColumns, *, in_order: bool = True) -> C
             or looks like Unix time. The message names file, column, line and time.
     """
     with errors_of(path):
-        return _read(path, known, in_order)
-
-
-def _read(path: Path, known: ChannelColumns, in_order: bool) -> CsvTable:
-    data = read_text(path)
-    header = _header(data, known)
-    layout = TextLayout(tuple(header), ",", 2, time="t_s", strict=True)
-    words = [name for name in header if name in known.texts]
-    table = read_columns(path, data, layout, [n for n in header if n not in (*words, "t_s")], ["t_s", *words])
-    t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
-    _check_times(t_ns, in_order=in_order)
+        data = read_text(path)
+        header = _header(data, known)
+        layout = TextLayout(tuple(header), ",", 2, time="t_s", strict=True)
+        words = [name for name in header if name in known.texts]
+        numbers = [name for name in header if name not in (*words, "t_s")]
+        table = read_columns(path, data, layout, numbers, ["t_s", *words])
+        t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
+        _check_times(t_ns, in_order=in_order)
     texts = {name: table.texts[name] for name in words}
     return CsvTable(t_ns=t_ns, numbers=table.numbers, texts=texts, file=path.name, notes=table.notes)
 

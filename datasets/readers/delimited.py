@@ -278,8 +278,11 @@ def _since_s(data: bytes, layout: TextLayout, cells: Sequence[str]) -> float | N
 
 def _check_counts(data: bytes, layout: TextLayout) -> None:
     """Refuse the first line that has not as many cells as there are columns."""
-    quoted = layout.separator != BLANKS and b'"' in data
-    for line, text, count in _quoted_counts(data, layout) if quoted else _counts(data, layout):
+    lines = _counts(data, layout)
+    if layout.separator != BLANKS and b'"' in data:
+        rows = _rows(data, layout)
+        lines = ((line, layout.separator.join(cells) or ".", len(cells)) for line, cells in rows)
+    for line, text, count in lines:
         if count == len(layout.names) or line < layout.first_line or not text.strip():
             continue
         if layout.comment and text[0] == layout.comment:
@@ -303,11 +306,6 @@ def _counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
         count = len(line.split()) if layout.separator == BLANKS else line.count(mark) + 1
         if count != width:
             yield number, line[:500].decode("utf-8", "replace").rstrip("\n"), count
-
-
-def _quoted_counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    for number, cells in _rows(data, layout):
-        yield number, layout.separator.join(cells) or ".", len(cells)
 
 
 def _parse(

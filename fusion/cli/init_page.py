@@ -46,8 +46,8 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
     contents = bag_contents(log, topics)
     if contents is None:
         return topics
-    start_ns = min((int(topic.t_ns[0]) for topic in contents.topics), default=0)
-    clocks = {topic.name: clock(start_ns, topic.t_ns) for topic in contents.topics}
+    start_ns = min((int(t_ns[0]) for t_ns in contents.times_ns.values()), default=0)
+    clocks = {name: clock(start_ns, t_ns) for name, t_ns in contents.times_ns.items()}
     print_lines(clock_table(clocks, "topic"))
     if contents.unused:
         print_lines(entry("not used", "dim", ", ".join(contents.unused)))

@@ -16,22 +16,14 @@ from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
 
 
 @dataclass(frozen=True)
-class TopicContents:
-    """A topic of a type that is read, and when its (N,) messages were received: one clock for all topics."""
-
-    name: str
-    msgtype: str
-    t_ns: TimesNs
-
-
-@dataclass(frozen=True)
 class BagContents:
     """Topics of a bag, and by channel those sensors with data between which only the user can choose.
 
+    `times_ns` are when the (N,) messages of each topic that is read were received: one clock for all topics.
     `unused` are name and type of the topics that no channel is made of.
     """
 
-    topics: tuple[TopicContents, ...]
+    times_ns: dict[str, TimesNs]
     unused: tuple[str, ...]
     candidates: dict[str, tuple[str, ...]]
 
@@ -67,11 +59,8 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
         streams = read_streams(container, {(t.name, t.msgtype): _fields_of(t) for t in usable})
         chosen_topics(container, Request(path, topics=topics), open_to_the_user)
-    contents = []
-    for topic in usable:
-        t_ns = streams[topic.name, topic.msgtype].receipt_ns
-        if len(t_ns):  # the index of a bag may count messages that are not there
-            contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
+    times_ns = {topic.name: np.sort(streams[topic.name, topic.msgtype].receipt_ns) for topic in usable}
+    held = {name: t_ns for name, t_ns in times_ns.items() if len(t_ns)}  # an index may count too many
     others = [topic for topic in there if topic not in usable and topic.name != STATIC[0]]
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in others)
-    return BagContents(tuple(contents), unused, candidates)
+    return BagContents(held, unused, candidates)

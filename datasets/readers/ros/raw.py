@@ -83,20 +83,16 @@ class BagContainer(Protocol):
     @property
     def cut(self) -> str:
         """In which way the file is cut off, "" where it is whole; what is there can be read."""
-        ...
 
     @property
     def sources(self) -> list[BagSource]:
         """Who sent its messages."""
-        ...
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources."""
-        ...
 
     def close(self) -> None:
         """Give the file back."""
-        ...
 
 
 def grouped(numbers: NDArray[Any], wanted: Groups) -> Iterator[tuple[int, Places]]:

@@ -134,15 +134,13 @@ def collect(text: str) -> tuple[list[Epoch], list[str]]:
     if damaged * 2 > total or not total:
         what = f"{damaged} of {total} sentences are damaged" if total else "no sentence of a receiver"
         raise DataError(what, remedy="check the cable and the baud rate, and record it again")
-    notes = []
-    if damaged:
-        notes.append(f"gnss: {damaged} of {total} sentences are damaged (checksum or fields); left out")
-    if timeless:
-        notes.append(f"gnss: {timeless} sentences of a receiver without time yet; left out")
-    if unchecked:
-        notes.append(f"gnss: {unchecked} sentences have no checksum; taken as they are")
-    if log.left_out:
-        notes.append(f"gnss: {log.left_out} estimated, manual or simulated positions left out")
+    remarks = (
+        (damaged, f"of {total} sentences are damaged (checksum or fields); left out"),
+        (timeless, "sentences of a receiver without time yet; left out"),
+        (unchecked, "sentences have no checksum; taken as they are"),
+        (log.left_out, "estimated, manual or simulated positions left out"),
+    )
+    notes = [f"gnss: {count} {what}" for count, what in remarks if count]
     epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", remedy="record GGA or RMC")

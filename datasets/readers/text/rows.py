@@ -67,19 +67,15 @@ def read_rows(
             its time. Times are not checked for order: `put_in_time` does that.
     """
     with errors_of(path):
-        return _read(path, columns, separator, header, comment)
-
-
-def _read(path: Path, columns: Sequence[str], separator: str, header: bool, comment: str) -> NumberRows:
-    data = read_text(path)
-    names = _header(data, columns, separator) if header else tuple(columns)
-    layout = TextLayout(names, separator, 2 if header else 1, comment, columns[0])
-    table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
-    t_ns = table.times_ns(columns[0])
-    values = table.stack(columns[1:])
-    missing = np.argwhere(np.isnan(values))
-    if missing.size:
-        raise table.bad_cell(columns[int(missing[0, 1]) + 1], int(missing[0, 0]), "give a finite number")
+        data = read_text(path)
+        names = _header(data, columns, separator) if header else tuple(columns)
+        layout = TextLayout(names, separator, 2 if header else 1, comment, columns[0])
+        table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
+        t_ns = table.times_ns(columns[0])
+        values = table.stack(columns[1:])
+        missing = np.argwhere(np.isnan(values))
+        if missing.size:
+            raise table.bad_cell(columns[int(missing[0, 1]) + 1], int(missing[0, 0]), "give a finite number")
     return NumberRows(path, t_ns, values, np.arange(len(t_ns)) + layout.first_line, table.notes)
 
 

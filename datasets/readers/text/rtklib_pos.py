@@ -200,10 +200,8 @@ class _Solution:
     def _along_axes(self, local: bool) -> Fixes:
         """Fixes with sigmas and velocities along east, north and up."""
         place = self.stack(*POSITIONS[BASELINE]) if local else self._llh()
-        sigma, velocity = (
-            self.stack("sde(m)", "sdn(m)", "sdu(m)"),
-            self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)"),
-        )
+        sigma = self.stack("sde(m)", "sdn(m)", "sdu(m)")
+        velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")
         sigma_v = _horizontal(self.stack("sdve", "sdvn"))
         return Fixes(self.times.t_ns, place, self.fix, sigma, velocity, sigma_v, local)
 
@@ -235,18 +233,11 @@ class _Solution:
         llh = np.stack(pymap3d.ecef2geodetic(*xyz.T), axis=1)
         _, R, _ = enu_from_ecef(xyz[:1])  # one rotation: a robot stays near its first fix
         velocity = self.stack("vx(m/s)", "vy(m/s)", "vz(m/s)") @ R.T
-        P = _covariances(
-            self.stack("sdx(m)", "sdy(m)", "sdz(m)"), self.stack("sdxy(m)", "sdyz(m)", "sdzx(m)")
-        )
+        cross = self.stack("sdxy(m)", "sdyz(m)", "sdzx(m)")
+        P = _covariances(self.stack("sdx(m)", "sdy(m)", "sdz(m)"), cross)
         V = _covariances(self.stack("sdvx", "sdvy", "sdvz"), self.stack("sdvxy", "sdvyz", "sdvzx"))
-        return Fixes(
-            self.times.t_ns,
-            llh,
-            self.fix,
-            _sigmas(R @ P @ R.T),
-            velocity,
-            _horizontal(_sigmas(R @ V @ R.T)[:, :2]),
-        )
+        sigma, sigma_v = _sigmas(R @ P @ R.T), _horizontal(_sigmas(R @ V @ R.T)[:, :2])
+        return Fixes(self.times.t_ns, llh, self.fix, sigma, velocity, sigma_v)
 
     def _fix(self) -> NDArray[np.uint8]:
         if "Q" not in self.columns.numbers:

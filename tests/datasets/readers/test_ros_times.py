@@ -188,7 +188,7 @@ def test_the_contents_of_a_bag_are_by_the_clock_of_the_recorder(tmp_path: Path) 
         rows.append(("/fix", TYPES["/fix"], T0 + k * 10 * MS, MAKE1.fix(T0 + k * 10 * MS, 48.0, 11.0)))
     contents = bag_contents(str(write_ros1(tmp_path / "a.bag", rows)))
     assert contents is not None
-    assert [int(topic.t_ns[0]) for topic in contents.topics] == [T0, T0]
+    assert [int(t_ns[0]) for t_ns in contents.times_ns.values()] == [T0, T0]
 
 
 def test_a_simulated_clock_may_start_at_zero(tmp_path: Path) -> None:
