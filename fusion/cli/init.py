@@ -15,7 +15,6 @@ from terrafusion.fusion.cli.command import Result
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.datasets.core.sensors import Rig
-    from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import FirstVehicle
     from terrafusion.fusion.metrics.verdict import Verdict
 
@@ -67,19 +66,16 @@ def init(
         result_lines,
     )
     from terrafusion.fusion.cli.inspect_page import print_lines
+    from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import base_of, first_vehicle, generic_rig
 
-    answers = _answers(
-        out,
-        vehicle_name,
-        drive=drive,
-        wheel_radius_m=wheel_radius,
-        track_m=track,
-        wheelbase_m=wheelbase,
-        antenna_m=antenna,
-        imu_m=imu_position,
-        mass_kg=mass,
-    )
+    common.refuse_no_yaml(out)
+    texts = {
+        "drive": drive, "wheel_radius_m": wheel_radius, "track_m": track, "wheelbase_m": wheelbase,
+        "antenna_m": antenna, "imu_m": imu_position, "mass_kg": mass,
+    }  # fmt: skip
+    given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
+    answers = Answers(vehicle_name or out.stem, **given)
     how.options(None)  # reports wrong usage before anything is read
     first_log = _FirstLog(log, how)
     with decoded_once():
@@ -99,15 +95,6 @@ def init(
         "next": [line.partition(": ")[2] for line in (*first_step, command)]
     }
     return Result([*lines, *first_step], command, document, short=f"written to {out}")
-
-
-def _answers(out: Path, vehicle_name: str | None, **texts: str | None) -> Answers:
-    """What the options say of the robot, by the names of the vehicle file."""
-    from terrafusion.fusion.init.answers import Answers
-
-    common.refuse_no_yaml(out)
-    given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
-    return Answers(vehicle_name or out.stem, **given)
 
 
 @dataclass

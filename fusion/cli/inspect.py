@@ -1,10 +1,15 @@
 """`terrafusion inspect LOG`: contents of a log and findings of the log checks on one page."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.core.sensors import Rig
 
 
 def inspect(
@@ -35,16 +40,17 @@ def inspect(
     Args:
         report (FILE.html): Also write this as a page.
     """
-    from terrafusion.fusion.cli.inspect_page import contents_lines, page_lines
+    from terrafusion.fusion.cli.inspect_page import contents_lines, finding_lines
 
-    page = inspected(log, vehicle, topic, stamps, columns)
+    page = _inspected(log, common.load_rig(vehicle), common.HowRead(topic, stamps, columns, True))
+    contents = list(contents_lines(page))
     if report is not None:
         from terrafusion.fusion.reports.inspect import write_inspection
 
-        write_inspection(report, page, [text for _, text in contents_lines(page)], common.command_line())
+        write_inspection(report, page, [text for _, text in contents], common.command_line())
     done = "" if report is None else f"report: {report}"
     failed = any(finding["severity"] == "error" for finding in page.get("findings", ()))
-    return Result(list(page_lines(page)), done, page, int(failed), short=_found(page))
+    return Result([*contents, *finding_lines(page)], done, page, int(failed), short=_found(page))
 
 
 def _found(page: dict[str, Any]) -> str:
@@ -54,21 +60,14 @@ def _found(page: dict[str, Any]) -> str:
     return f"findings: {', '.join(counts) or 'none'}"
 
 
-def inspected(
-    log: str,
-    vehicle: str | None = None,
-    topic: list[str] | None = None,
-    stamps: str = "header",
-    columns: Path | None = None,
-) -> dict[str, Any]:
+def _inspected(log: str, rig: Rig | None, how: common.HowRead) -> dict[str, Any]:
     """The page as plain data; see `terrafusion.datasets.checks.summary`."""
     from terrafusion.datasets.checks import run_checks
     from terrafusion.datasets.checks.measures import measure
     from terrafusion.datasets.checks.summary import summarise, summarise_all
     from terrafusion.datasets.readers import open_recordings
 
-    rig = common.load_rig(vehicle)
-    recordings = open_recordings(log, **common.HowRead(topic, stamps, columns, True).options(rig))
+    recordings = open_recordings(log, **how.options(rig))
     common.warn_of_log(log, recordings)
     findings = [run_checks(recording, common.rig_of(recording, rig)) for recording in recordings]
     measures = measure(recordings, common.rig_of(recordings[0], rig))

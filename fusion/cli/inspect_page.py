@@ -22,12 +22,6 @@ def print_lines(lines: Iterable[Line]) -> None:
         print(styled(line))
 
 
-def page_lines(page: dict[str, Any]) -> Iterator[Line]:
-    """The whole page."""
-    yield from contents_lines(page)
-    yield from _findings(page)
-
-
 def contents_lines(page: dict[str, Any]) -> Iterator[Line]:
     """The page without its findings."""
     yield from _title(page)
@@ -150,7 +144,8 @@ def _note(note: str | dict[str, Any], recordings: int) -> str:
     return f"{note['note']} ({_glued(', '.join(remarks))})" if remarks else str(note["note"])
 
 
-def _findings(page: dict[str, Any]) -> Iterator[Line]:
+def finding_lines(page: dict[str, Any]) -> Iterator[Line]:
+    """The findings of the page."""
     yield "", ""
     without_wheels = "wheels" not in page["channels"]
     if without_wheels:

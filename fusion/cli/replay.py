@@ -15,7 +15,6 @@ from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
-    from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
     from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.metrics.scores import Outage
@@ -91,14 +90,19 @@ def replay(
     from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.grounds.file import read_grounds
     from terrafusion.fusion.replay import replay as run
+    from terrafusion.fusion.reports.rerun_log import require_rerun
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
-    _check_usage(mode, rerun)
+    common.check_mode(mode)
+    if rerun is not None:
+        require_rerun()
     turned = None if declination is None else math.radians(declination)
     outages = [_outage(text) for text in gnss_outage or []]
     memory = None if grounds is None else read_grounds(grounds)
     model = None if terrain_model is None else load_terrain_model(terrain_model)
-    recording, findings = _opened(log, vehicle, how, calibrate)
+    rig = common.load_rig(vehicle)
+    recording = how.open(log, rig)
+    findings = common.refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
     with common.progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording, vehicle=vehicle, mode=mode, policy=policy, outages=outages, batch=batch,
@@ -119,24 +123,6 @@ def _outage(text: str) -> Outage:
         return parse_outage(text)
     except ConfigError as error:
         raise typer.BadParameter(str(error), param_hint="--gnss-outage") from None
-
-
-def _check_usage(mode: str, rerun: Path | None) -> None:
-    """Refuse an unknown mode, and a file for Rerun where that is not installed."""
-    from terrafusion.fusion.reports.rerun_log import require_rerun
-
-    common.check_mode(mode)
-    if rerun is not None:
-        require_rerun()
-
-
-def _opened(
-    log: str, vehicle: str | None, how: common.HowRead, calibrate: bool
-) -> tuple[Recording, list[Finding]]:
-    """The log and the findings of the log checks; one whose numbers would mislead is refused."""
-    rig = common.load_rig(vehicle)
-    recording = how.open(log, rig)
-    return recording, common.refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
 
 
 def _write(

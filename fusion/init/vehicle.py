@@ -111,7 +111,7 @@ def first_vehicle(
     with scratch_folder() as folder, _errors_of_log(folder, first.name):
         file = folder / "vehicle.yaml"
         mounted = _mounted(open_log, head | geometry | tail, file)
-        if mounted.turned:  # what is measured about z holds only now
+        if mounted.axes or mounted.repaired:  # what is measured about z holds only now
             tail = mounted.axes | tail
             measured, geometry = _geometry(mounted.recording, answers, base, rig)
         tilted, tilt_notes = tilt_lines(measure_tilt(mounted.recording, base), mounted.recording.name)
@@ -186,11 +186,6 @@ class _Mounted:
     axes: Draft
     repaired: tuple[Finding, ...]
     findings: tuple[Finding, ...]
-
-    @property
-    def turned(self) -> bool:
-        """Whether it is another log than before."""
-        return bool(self.axes or self.repaired)
 
 
 def _mounted(open_log: Open, draft: Draft, file: Path) -> _Mounted:

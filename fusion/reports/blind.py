@@ -39,11 +39,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
         lead=lead, verdicts=[_verdict(scores)], tiles=_tiles(scores), provenance=provenance,
         packages=TWIN_LIBRARIES,
         methods=list(scores["figures"]),
-        headline=[
-            [row["name"], *(measured(row[m]) for m in scores["figures"]), target_text(row["target"]),
-             MET[row["diagnosis"]["met"]]]
-            for row in scores["headline"]
-        ],
+        headline=_headline(scores),
         kinds=VERDICTS,
         families=[
             [family, *(str(counts.get(kind, 0)) for kind in VERDICTS)]
@@ -117,14 +113,19 @@ def summary(scores: Scores) -> list[str]:
     """The headline as text: a figure, its 95 % interval, the same of the opponent, the target."""
     methods = list(scores["figures"])
     crashes = ", ".join(f"{len(f['crashes'])} of the {m}" for m, f in scores["figures"].items())
-    rows = [
-        [row["name"], *(measured(row[m]) for m in methods), target_text(row["target"]),
-         MET[row["diagnosis"]["met"]]]
-        for row in scores["headline"]
-    ]  # fmt: skip
-    lines = text_table(["", *methods, "target", ""], rows)
+    lines = text_table(["", *methods, "target", ""], _headline(scores))
     count = f"{scores['trials']} of {scores.get('planned', scores['trials'])}"
     return [f"{count} trials of plant {plant_name(scores)}; crashes: {crashes}", *lines]
+
+
+def _headline(scores: Scores) -> list[list[str]]:
+    return [
+        [
+            row["name"], *(measured(row[method]) for method in scores["figures"]), target_text(row["target"]),
+            MET[row["diagnosis"]["met"]],
+        ]
+        for row in scores["headline"]
+    ]  # fmt: skip
 
 
 def draw(sheet: Sheet, scores: Scores) -> None:

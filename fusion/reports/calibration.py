@@ -23,7 +23,7 @@ STATUS = {IDENTIFIED: "yes", COMBINED: "only in combination", NOT_IDENTIFIED: "n
 
 def write_calibration(
     out: Path,
-    calibration: Calibration,
+    c: Calibration,
     vehicle: str | Path,
     soils: Mapping[str, str | Path] | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -37,20 +37,16 @@ def write_calibration(
     Raises:
         TerrafusionError: the folder cannot be written.
     """
-    text = json.dumps(calibration.as_dict(), indent=1, allow_nan=False)
+    text = json.dumps(c.as_dict(), indent=1, allow_nan=False)
     write_text(out / "calibration.json", text + "\n")
-    write_files(calibration, out, vehicle, soils)
-    write_report(out / "report.html", calibration, provenance)
-
-
-def write_report(path: Path, c: Calibration, provenance: Mapping[str, object] | None = None) -> Path:
-    """The report alone."""
+    write_files(c, out, vehicle, soils)
     sheet = Sheet()
     plot_parameters(sheet, c)
     plot_correlation(sheet, c)
     fits = {log: plot_channels(sheet, c, log) for log in list(c.sensor_errors)[:MOST_FIGURES]}
-    return write_page(
-        path, "calibration.html.j2", f"Calibration of {c.model.vehicle.name} on {', '.join(c.model.soils)}",
+    name, grounds = c.model.vehicle.name, ", ".join(c.model.soils)
+    write_page(
+        out / "report.html", "calibration.html.j2", f"Calibration of {name} on {grounds}",
         verdicts=[_verdict(c)], tiles=_tiles(c), provenance=provenance, packages=TWIN_LIBRARIES,
         parameters=_parameters(c), channels=_channels(c), notes=c.notes, fits=fits, **sheet.parts(),
     )  # fmt: skip

@@ -80,21 +80,9 @@ def samples_of(recording: Recording) -> GroundSamples:
     truth = recording.truth
     assert truth is not None
     assert truth.twist_body is not None
-    slip, grade, pairs, grade_pairs, wheel = _slip_samples(recording)
-    gyro, gyro_yaw, accel = _imu_samples(recording)
-    return GroundSamples(
-        slip,
-        grade,
-        pairs,
-        grade_pairs,
-        wheel,
-        _yaw_scales(recording),
-        side_slips_of(truth.twist_body[:, 0], truth.twist_body[:, 1], truth.twist_body[:, 5]),
-        gyro,
-        gyro_yaw,
-        accel,
-        _gnss_samples(recording),
-    )
+    side_slip = side_slips_of(*truth.twist_body[:, [0, 1, 5]].T)
+    slip, imu = _slip_samples(recording), _imu_samples(recording)
+    return GroundSamples(*slip, _yaw_scales(recording), side_slip, *imu, _gnss_samples(recording))
 
 
 def _slip_samples(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:

@@ -14,7 +14,7 @@ from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.summary import summarise, summarise_all
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.cli.inspect_page import WIDTH, page_lines
+from terrafusion.fusion.cli.inspect_page import WIDTH, contents_lines, finding_lines
 
 
 def cut(recording: Recording, seconds: float) -> list[Recording]:
@@ -57,7 +57,7 @@ def test_a_standing_robot_has_no_path(drive: Recording) -> None:
 
 def lines_of(page: dict) -> str:
     json.dumps(page, allow_nan=False)
-    lines = [line for _, line in page_lines(page)]
+    lines = [line for _, line in (*contents_lines(page), *finding_lines(page))]
     assert max(len(line) for line in lines) <= WIDTH
     return "\n".join(lines)
 
