@@ -44,6 +44,10 @@ class TerrafusionError(Exception):
             message = f"{message}; {remedy}"
         super().__init__(printable(" ".join(message.split())))
 
+    def of(self, file: str | Path | None) -> Self:
+        """The same error of another file."""
+        return type(self)(self.what, file=file, channel=self.channel, time_s=self.time_s, remedy=self.remedy)
+
 
 class DataError(TerrafusionError):
     """A recording, or a part of it, that cannot be read or used."""
@@ -69,5 +73,4 @@ def errors_of(file: str | Path) -> Iterator[None]:
     except DataError as error:
         if error.file is not None:
             raise
-        kind, channel, time_s = type(error), error.channel, error.time_s
-        raise kind(error.what, file=file, channel=channel, time_s=time_s, remedy=error.remedy) from None
+        raise error.of(file) from None

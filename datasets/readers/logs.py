@@ -23,13 +23,11 @@ def opened(logs: Log | Sequence[Log], rig: Rig | None = None) -> list[Recording]
         DataError: what is given is no log, or a log cannot be read.
     """
     several = logs if isinstance(logs, Iterable) and not isinstance(logs, str) else [logs]
-    return [_opened(log, rig) for log in several]
-
-
-def _opened(log: Log, rig: Rig | None) -> Recording:
-    if not isinstance(log, (Recording, str, Path)):
-        raise DataError(
-            f"a {type(log).__name__} is no log", remedy="give a Recording, or the path or name of a log"
-        )
-    recording = log if isinstance(log, Recording) else open_recording(log, rig=rig)
-    return recording if rig is None else turned_as_mounted(recording, rig)
+    found = []
+    for log in several:
+        if not isinstance(log, (Recording, str, Path)):
+            remedy = "give a Recording, or the path or name of a log"
+            raise DataError(f"a {type(log).__name__} is no log", remedy=remedy)
+        recording = log if isinstance(log, Recording) else open_recording(log, rig=rig)
+        found.append(recording if rig is None else turned_as_mounted(recording, rig))
+    return found

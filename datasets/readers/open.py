@@ -94,14 +94,25 @@ def find_log(path: Path | str) -> tuple[Path, int | None]:
     Raises:
         DataError: it cannot be read; or it is in the catalogue, but not on this machine, or a document.
     """
+    text, mark, number = str(path).rpartition("#")
+    numbered = bool(mark) and number.isascii() and number.isdigit() and len(number) < 9
     try:
-        return _find_log(path)
+        numbered = numbered and not Path(path).exists()
+        name = text if numbered else str(path)
+        place = Path(name)
+        if not place.exists():
+            place = locate(name) or _misspelt(name, place)
+        entry = load_catalog().find(place) if place.is_file() else None
     except OSError as error:
         raise DataError(
             f"cannot be read: {error.strerror or error}",
             file=path,
             remedy="check the path and its permissions",
         ) from None
+    if entry is not None and not entry.recording:
+        remedy = f"`terrafusion fetch` lists the recordings of {entry.set_name}"
+        raise DataError(f"is a document of the set {entry.set_name}, no recording", file=place, remedy=remedy)
+    return place, int(number) if numbered else None
 
 
 def files_of(path: Path | str) -> list[Path]:
@@ -128,22 +139,6 @@ def hashes_of(logs: Sequence[str]) -> dict[str, str]:
         if len(set(names)) == len(files):
             break
     return {name: sha256_of(file) for name, file in zip(names, files, strict=True)}
-
-
-def _find_log(path: Path | str) -> tuple[Path, int | None]:
-    text, mark, number = str(path).rpartition("#")
-    numbered = (
-        bool(mark) and number.isascii() and number.isdigit() and len(number) < 9 and not Path(path).exists()
-    )
-    name = text if numbered else str(path)
-    place = Path(name)
-    if not place.exists():
-        place = locate(name) or _misspelt(name, place)
-    entry = load_catalog().find(place) if place.is_file() else None
-    if entry is not None and not entry.recording:
-        remedy = f"`terrafusion fetch` lists the recordings of {entry.set_name}"
-        raise DataError(f"is a document of the set {entry.set_name}, no recording", file=place, remedy=remedy)
-    return place, int(number) if numbered else None
 
 
 def _misspelt(name: str, place: Path) -> Path:

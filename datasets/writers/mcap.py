@@ -21,7 +21,7 @@ from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.log_folder import OutputTable, meta_of, tables_of, vehicle_file, writing
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
-from terrafusion.datasets.writers.mcap_file import Definition, TopicMessages, write_mcap_file
+from terrafusion.datasets.writers.mcap_file import TopicMessages, write_mcap_file
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
@@ -93,7 +93,7 @@ def write_mcap(
         path.parent.mkdir(parents=True, exist_ok=True)
         with scratch_folder(path.parent) as scratch:
             whole = scratch / path.name
-            write_mcap_file(whole, topics, _definitions(topics), "terrafusion")
+            write_mcap_file(whole, topics, _definitions(topics))
             whole.replace(path)
     return tuple(parts.unseen)
 
@@ -119,15 +119,12 @@ def _check_times(topic: TopicMessages, path: Path) -> None:
             )
 
 
-def _definitions(topics: list[TopicMessages]) -> dict[str, Definition]:
+def _definitions(topics: list[TopicMessages]) -> dict[str, tuple[str, str]]:
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     names = {topic.msgtype for topic in topics}
-    return {
-        name: Definition(store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
-        for name in names
-    }
+    return {name: (store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)) for name in names}
 
 
 class _Parts:

@@ -32,37 +32,28 @@ class TopicMessages:
     latched: bool = False
 
 
-@dataclass(frozen=True)
-class Definition:
-    """Text of a message definition with all it refers to, and its hash after REP-2011."""
-
-    text: str
-    digest: str
-
-
 def write_mcap_file(
-    path: Path, topics: Sequence[TopicMessages], definitions: Mapping[str, Definition], library: str
+    path: Path, topics: Sequence[TopicMessages], definitions: Mapping[str, tuple[str, str]]
 ) -> None:
     """Write all messages in the order of their times; of equal times in the order of the topics.
 
     Args:
         topics: at least one with messages, at most 65535; empty ones stay as channels.
-        definitions: by message type.
-        library: name of the writer, for the header.
+        definitions: by message type, its text with all it refers to, and its hash after REP-2011.
 
     Raises:
         OSError: the file cannot be written.
     """
     with path.open("wb") as out:
         writer = Writer(out)
-        writer.start("ros2", library)
+        writer.start("ros2", "terrafusion")
         types = {
-            name: writer.register_schema(name, "ros2msg", definitions[name].text.encode())
+            name: writer.register_schema(name, "ros2msg", definitions[name][0].encode())
             for name in dict.fromkeys(topic.msgtype for topic in topics)
         }
         channels = []
         for topic in topics:
-            qos, digest = qos_profile(topic.latched), definitions[topic.msgtype].digest
+            qos, (_, digest) = qos_profile(topic.latched), definitions[topic.msgtype]
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
             channels.append(writer.register_channel(topic.name, "cdr", types[topic.msgtype], metadata))
         which = np.repeat(np.arange(len(topics)), [len(topic.t_ns) for topic in topics])

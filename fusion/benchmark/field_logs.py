@@ -133,14 +133,7 @@ def refusal_of(name: str, error: Exception) -> Refusal:
     if not isinstance(error, TerrafusionError):
         return Refusal(name, f"FAILED, {type(error).__name__}: {error}")
     file = None if error.file is None else Path(error.file).name
-    reason = TerrafusionError(
-        error.what,
-        file=None if file == Path(name).name else file,
-        channel=error.channel,
-        time_s=error.time_s,
-        remedy=error.remedy,
-    )
-    return Refusal(name, str(reason))
+    return Refusal(name, str(error.of(None if file == Path(name).name else file)))
 
 
 def check_log(recording: Recording) -> None:

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafusion.fusion.benchmark.compare import EVEN, Contrast, contrasts, groups_of
+from terrafusion.fusion.benchmark.compare import EVEN, contrasts, groups_of
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, ORACLE
 from terrafusion.fusion.benchmark.run_score import RunScore
 
@@ -59,25 +59,13 @@ def reasons(rows: Sequence[RunScore]) -> list[Reason]:
             if c.method == ADAPTIVE and c.ratio > 1.0 + EVEN
         ]
         if lost:
-            worst = max(lost, key=lambda c: c.ratio)
-            out.append(_reason(family, plant, worst, group))
+            c = max(lost, key=lambda c: c.ratio)
+            sure = c.interval is not None and c.interval[0] > 1.0
+            oracle = next((o.ratio for o in contrasts(group, c.baseline) if o.method == ORACLE), None)
+            ground, kind = _where(group, c.baseline)
+            shares = recognised(group), recognised(group, ground) if ground else None
+            out.append(Reason(family, plant, c.baseline, c.ratio, sure, oracle, ground, kind, shares))
     return out
-
-
-def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore]) -> Reason:
-    oracle = [c.ratio for c in contrasts(group, worst.baseline) if c.method == ORACLE]
-    ground, kind = _where(group, worst.baseline)
-    return Reason(
-        family,
-        plant,
-        worst.baseline,
-        worst.ratio,
-        worst.interval is not None and worst.interval[0] > 1.0,
-        oracle[0] if oracle else None,
-        ground,
-        kind,
-        (recognised(group), recognised(group, ground) if ground else None),
-    )
 
 
 def recognised(rows: Sequence[RunScore], ground: str = "") -> float | None:

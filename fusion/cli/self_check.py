@@ -3,7 +3,6 @@
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, Literal
 
 from terrafusion.fusion.cli.command import Result
@@ -86,26 +85,23 @@ def _compiler() -> Check:
 
 def _caches() -> Iterator[Check]:
     from terrafusion.datasets.catalog.catalog import cache_folder
+    from terrafusion.datasets.core.errors import TerrafusionError
+    from terrafusion.datasets.core.files import check_folder
     from terrafusion.twin.engine.library_cache import wanted_folder
 
     for name, folder, remedy in (
         ("cache of compiled code", wanted_folder(), "set TERRAFUSION_CACHE to a folder of your own"),
         ("cache of downloads", cache_folder(), "give `terrafusion fetch --to FOLDER`, or set XDG_CACHE_HOME"),
     ):
-        yield _cache(name, folder, remedy)
-
-
-def _cache(name: str, folder: Path | None, remedy: str) -> Check:
-    from terrafusion.datasets.core.errors import TerrafusionError
-    from terrafusion.datasets.core.files import check_folder
-
-    if folder is None:
-        return Check(name, "broken", "there is no home folder", remedy)
-    try:
-        check_folder(folder)
-    except TerrafusionError:
-        return Check(name, "broken", f"{folder} cannot be written", remedy)
-    return Check(name, "ok", str(folder))
+        if folder is None:
+            yield Check(name, "broken", "there is no home folder", remedy)
+            continue
+        try:
+            check_folder(folder)
+        except TerrafusionError:
+            yield Check(name, "broken", f"{folder} cannot be written", remedy)
+        else:
+            yield Check(name, "ok", str(folder))
 
 
 def _drive(seconds: float, **options: Any) -> Any:

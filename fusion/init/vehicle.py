@@ -139,7 +139,7 @@ def _errors_of_log(folder: Path, name: str) -> Iterator[None]:
     except ConfigError as error:
         if error.file is None or folder not in Path(error.file).parents:
             raise
-        raise ConfigError(error.what, file=name, channel=error.channel, remedy=error.remedy) from None
+        raise error.of(name) from None
 
 
 def _geometry(

@@ -238,6 +238,8 @@ _CLASSES = ((Fix.FIXED, 0.05), (Fix.FLOAT, 0.5), (Fix.DGPS, 1.0), (Fix.SINGLE, n
 MAGIC = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
+CLASS = "MATLAB_class"
+"""Attribute of each variable."""
 
 
 def variables(path: Path) -> set[str] | None:
@@ -351,17 +353,13 @@ class MatlabFile:
 
     def _texts(self, cell: list[Any]) -> list[str]:
         """The cell's texts, or nothing where one is no text."""
-        if any(self._kind(part) != b"char" or math.prod(part.shape) > 100 for part in cell):
+        if any(part.attrs.get(CLASS) != b"char" or math.prod(part.shape) > 100 for part in cell):
             return []
         return ["".join(map(chr, self._values(part, "a table").astype(int).ravel())) for part in cell]
 
     def _columns(self, cell: list[Any]) -> list[Array]:
         """The cell's numeric columns, or nothing where it is no table."""
-        if any(self._kind(part) not in (b"double", b"single") for part in cell):
+        if any(part.attrs.get(CLASS) not in (b"double", b"single") for part in cell):
             return []
         columns = [self._values(part, "a table").ravel() for part in cell]
         return columns if len({len(column) for column in columns}) == 1 else []
-
-    @staticmethod
-    def _kind(part: Any) -> Any:
-        return part.attrs.get("MATLAB_class")
