@@ -63,10 +63,6 @@ class _Windows:
     place: Complex
     rows: list[slice]
 
-    def size_m(self) -> float:
-        """Median over the windows of the scatter of their positions about the mean."""
-        return float(np.median([np.std(self.place[rows]) for rows in self.rows]))
-
     @functools.cached_property
     def _measured(self) -> list[Complex]:
         """Dead reckoning by the gyro as it is, from which all delays are tried."""
@@ -153,7 +149,8 @@ def _fitted(windows: _Windows, start_s: float, usual_s: float, rest: float) -> P
             return None
     H, h, noise = _normal(windows, unknown)
     most_noise = MOST_CLEAR_NOISE if rest <= CLEARLY else MOST_NOISE
-    if len(H) < LEAST_WINDOWS or noise > most_noise * windows.size_m():
+    size_m = np.median([np.std(windows.place[rows]) for rows in windows.rows])
+    if len(H) < LEAST_WINDOWS or noise > most_noise * size_m:
         return None
     prior = np.diag(noise**2 / PRIOR**2)
     draws = resampled_rows(len(H))

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -318,6 +318,11 @@ class Terrain(Channel):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_width("probabilities", len(set(self.classes)))
+
+    @classmethod
+    def throughout(cls, start_ns: int, label: str) -> Self:
+        """One label from the start of a log on."""
+        return cls(np.array([start_ns], dtype=np.int64), np.array([label], dtype=object))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         table: dict[str, NDArray[Any]] = {"label": self.label}

@@ -208,9 +208,6 @@ def _truth_and_terrain(recording: Recording, c: Conventions) -> Recording:
         if lost:
             recording = recording.with_notes(f"truth: {', '.join(lost)} not good enough to score against")
     if c.terrain and not recording.terrain_name:
-        label = np.array([c.terrain], dtype=object)
-        terrain = Terrain(np.array([recording.start_ns]), label)
-        recording = dataclasses.replace(
-            recording, terrain_name=c.terrain, terrain=recording.terrain or terrain
-        )
+        terrain = recording.terrain or Terrain.throughout(recording.start_ns, c.terrain)
+        recording = dataclasses.replace(recording, terrain_name=c.terrain, terrain=terrain)
     return recording

@@ -142,13 +142,10 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
     return found
 
 
-def logs_in(folder: Path, most: int = 50) -> list[str]:
-    """Names of the readable files and log folders in a folder, sorted.
-
-    Only the first `most` entries are looked at.
-    """
+def logs_in(folder: Path) -> list[str]:
+    """Names of the readable files and log folders among the first 50 entries of a folder, sorted."""
     found = []
-    for path in sorted(folder.iterdir())[:most]:
+    for path in sorted(folder.iterdir())[:50]:
         try:
             form = format_of(path)
         except DataError:

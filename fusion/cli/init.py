@@ -57,6 +57,7 @@ def init(
         mass (KG): Mass; only the twin uses it.
         no_verdict: Write the file only; do not replay the log with it.
     """
+    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.datasets.readers.ros.streams import decoded_once
     from terrafusion.fusion.cli.init_page import (
         ask,
@@ -81,7 +82,9 @@ def init(
     with decoded_once():
         first_log.topics = choose_sensors(log, common.parse_topics(how.topic))
         first = first_log.read(generic_rig())
-        _refuse_own_base(out, base_of(first))
+        if Path(base_of(first)) == out.resolve():
+            what = "the log names this file as its vehicle, and the new file extends it"
+            raise ConfigError(what, file=out, remedy="give another --out")
         print_lines(contents_lines(first))
         answers = ask(answers, first_log.topics)
         with common.progress_bar("calibrating the sensors") as progress:
@@ -164,15 +167,6 @@ def _write(out: Path, log: str, found: FirstVehicle) -> None:
         draft = draft | {"extends": replace(draft["extends"], value=seen_from(out, Path(base)))}
     about = f"Vehicle file of the log '{found.recording.name}', written by: {common.command_line()}"
     write_draft(out, draft, about)
-
-
-def _refuse_own_base(out: Path, base: str) -> None:
-    """Refuse to write over the vehicle file that the log names, which the new one extends."""
-    from terrafusion.datasets.core.errors import ConfigError
-
-    if Path(base) == out.resolve():
-        what = "the log names this file as its vehicle, and the new file extends it"
-        raise ConfigError(what, file=out, remedy="give another --out")
 
 
 def _verdict(found: FirstVehicle, out: Path) -> Verdict:

@@ -16,7 +16,6 @@ from terrafusion.fusion.cli.outputs import Output
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
     from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
-    from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.metrics.scores import Outage
     from terrafusion.fusion.replay import ReplayResult
 
@@ -205,7 +204,10 @@ def summary(result: ReplayResult) -> list[str]:
         )
     if scores.against == "truth" and scores.ate_m is not None:
         lines.append(f"against truth: position error {scores.ate_m:.3f} m (root mean square)")
-    lines += _baseline_lines(result.baselines)
+    held_fix = "the receiver alone (its last fix held in gaps)"
+    alone = (("dead reckoning", result.baselines.dead_reckoning_m), (held_fix, result.baselines.gnss_m))
+    if shown := [f"{name} {error_m:.3f} m" for name, error_m in alone if error_m is not None]:
+        lines.append(f"for comparison, scored alike: {', '.join(shown)}")
     for outage in scores.outages:
         if outage.end_error_m is None or outage.median_m is None:
             lines.append(f"outage at {outage.start_s:g} s: nothing to score against near its end")
@@ -220,11 +222,3 @@ def summary(result: ReplayResult) -> list[str]:
     for what, value, sigma, *_ in map(cells, corrections):
         lines.append(f"self-calibration corrects: {what}: {value} +- {sigma}")
     return lines
-
-
-def _baseline_lines(baselines: Baselines) -> list[str]:
-    """The errors of the baselines, where they are scored."""
-    held = "the receiver alone (its last fix held in gaps)"
-    named = (("dead reckoning", baselines.dead_reckoning_m), (held, baselines.gnss_m))
-    shown = [f"{name} {error_m:.3f} m" for name, error_m in named if error_m is not None]
-    return [f"for comparison, scored alike: {', '.join(shown)}"] if shown else []

@@ -35,7 +35,7 @@ class Answers:
 
 
 def parse(text: str, name: str) -> str | KnownNumber:
-    """An answer by the name of its field.
+    """An answer by its name: a word, a number `0.12` or `0.12:data_sheet`, or a point `0.1,0,0.6`.
 
     Raises:
         ConfigError: it is malformed or out of range.
@@ -44,17 +44,7 @@ def parse(text: str, name: str) -> str | KnownNumber:
         if text.strip() not in DRIVES:
             raise ConfigError(f"the drive is '{text.strip()}'", remedy=f"give one of {', '.join(DRIVES)}")
         return text.strip()
-    number = parse_number(text, name, 3 if name in POINTS else 1)
-    structure(RobotFile, {"robot": {name: raw_number(number)}}, file=f"'{text}'")
-    return number
-
-
-def parse_number(text: str, name: str, size: int = 1) -> KnownNumber:
-    """A number as the user writes it, `0.12` or `0.12:data_sheet`; with `size` 3 a point, `0.1,0,0.6`.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    size = 3 if name in POINTS else 1
     numbers, _, source = text.partition(":")
     known = source.strip() or SOURCES[0]
     try:
@@ -67,4 +57,6 @@ def parse_number(text: str, name: str, size: int = 1) -> KnownNumber:
             f"{name} is '{text}'", remedy=f"write it as {example} (measured) or {example}:data_sheet"
         )
     sigma = abs(values[0]) * MASS_SIGMA[known] if name == "mass_kg" else None
-    return KnownNumber(values if size > 1 else values[0], known, sigma)
+    number = KnownNumber(values if size > 1 else values[0], known, sigma)
+    structure(RobotFile, {"robot": {name: raw_number(number)}}, file=f"'{text}'")
+    return number

@@ -35,7 +35,6 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.training.simulated_runs import seconds, wheel_samples
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
@@ -180,7 +179,8 @@ def _imu_samples(recording: Recording) -> tuple[Array, Array, Array]:
     rows = np.searchsorted(truth_t, np.append(imu_t[0] - step, imu_t) - 0.5 * step)
     rows = np.minimum(rows, len(truth_t) - 1)
     R = quaternion_to_matrix(truth.quaternion[rows])
-    velocity = _imu_velocity(truth.twist_body[rows], R, spec)
+    twist = truth.twist_body[rows]
+    velocity = np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m))  # the IMU's
     change = np.diff(velocity, axis=0) / step + np.array([0.0, 0.0, GRAVITY_MPS2])
     gyro = imu.gyro_radps - _rotation_vectors(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / step
     accel = imu.accel_mps2 - np.einsum("nji,nj->ni", R[:-1], change)
@@ -199,11 +199,6 @@ def _relative(error: Array, speed_mps: Array, step_s: float, tau_s: float, densi
     means = _unbiased(_block_means(error, count), count * step_s)
     rolling = _block_means(speed_mps, count) > TURNING_MPS
     return np.asarray((means[rolling] * np.sqrt(count * step_s) / density).ravel())
-
-
-def _imu_velocity(twist: Array, R: Array, spec: ImuSpec) -> Array:
-    """World velocity (n, 3) of the IMU."""
-    return np.asarray(np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m)))
 
 
 def _rotation_vectors(R: Array) -> Array:

@@ -225,7 +225,9 @@ class ChannelBuilder:
         stream, t_ns = stream.select(held), t_ns[held]
         speed = joint_values(stream, [*joints.values()], "velocity")
         angle = joint_values(stream, [*joints.values()], "position")
-        begin = _first_known(angle if speed is None else speed)
+        known = angle if speed is None else speed
+        # Drivers publish NaN until the hardware answers.
+        begin = 0 if known is None else int(np.argmax(np.isfinite(known).any(axis=1)))
         if begin:
             self.notes.append(f"wheels: {stream.topic}: the first {begin} messages hold no number; left out")
             speed, angle = (None if v is None else v[begin:] for v in (speed, angle))
@@ -380,8 +382,3 @@ class ChannelBuilder:
                 time_s=float(t_ns[i] - self.start_ns) * 1e-9,
                 remedy="correct the driver, or filter these messages out of the bag",
             )
-
-
-def _first_known(values: Array | None) -> int:
-    """The first row of values (N, k) with a number: drivers publish NaN until the hardware answers."""
-    return 0 if values is None else int(np.argmax(np.isfinite(values).any(axis=1)))

@@ -66,7 +66,6 @@ def read(request: Request) -> list[Recording]:
             )
     terrain, terrain_note = _terrain(folder.resolve().name)
     notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), terrain_note]
-    label = np.array([terrain], dtype=object)
     imu, pro = rows.get("imu"), rows.get("pro")
     recording = Recording(
         name=f"{folder.resolve().name}/{run}",
@@ -74,7 +73,7 @@ def read(request: Request) -> list[Recording]:
         wheels=Wheels(pro.t_ns, pro.values[:, 2:], ("left", "right"), "mps") if pro else None,
         imu=Imu(imu.t_ns, imu.values[:, :3], imu.values[:, 3:]) if imu else None,
         motor=Motor(pro.t_ns, pro.values[:, :2]) if pro else None,
-        terrain=Terrain(np.zeros(1, dtype=np.int64), label) if terrain else None,
+        terrain=Terrain.throughout(0, terrain) if terrain else None,
         terrain_name=terrain,
         clock_jumps=jumps,
         notes=tuple(notes),

@@ -130,7 +130,7 @@ def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:
         wheels=Wheels(t_ns[live], speed[live], SIDES, "radps"),
         imu=imu.select(_since_first(imu.accel_mps2.any(axis=1), "imu", "its first message", notes)),
         motor=motor,
-        terrain=_labels(int(t_ns[0]), terrain),
+        terrain=Terrain.throughout(int(t_ns[0]), terrain) if terrain else None,
         terrain_name=terrain,
         truth=_truth_of_drive(t_ns, table, notes),
         truth_channels=TRUTH_CHANNELS,
@@ -215,7 +215,7 @@ def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recordi
                 command=_command_of_window(t_ns, window["commanded"], conventions),
                 wheels=Wheels(t_ns, window["sides"], SIDES, "radps"),
                 imu=Imu(t_ns, gyro, window["accel"]),
-                terrain=_labels(0, terrain),
+                terrain=Terrain.throughout(0, terrain) if terrain else None,
                 terrain_name=terrain,
                 truth=Trajectory(t_ns, window["position"], rpy_to_quaternion(window["rpy"])),
                 truth_channels=TRUTH_CHANNELS,
@@ -272,12 +272,6 @@ def _of_folder(name: str, conventions: Conventions) -> tuple[str, list[str]]:
     if conventions.terrain or not terrain:
         return "", notes
     return terrain, [*notes, f"terrain: {terrain} by the folder's name"]
-
-
-def _labels(start_ns: int, terrain: str) -> Terrain | None:
-    if not terrain:
-        return None
-    return Terrain(np.array([start_ns], dtype=np.int64), np.array([terrain], dtype=object))
 
 
 ALLOWED = {
