@@ -127,6 +127,11 @@ class Recording:
             clocks["truth"] = self.truth.t_ns
         return clocks
 
+    def truth_holds(self, channel: str) -> bool:
+        """Whether there is a truth, and "position", "yaw", "orientation" or "velocity" of it can be used."""
+        there = self.truth is not None and len(self.truth) > 0
+        return there and (not self.truth_channels or channel in self.truth_channels)
+
     def end_ns(self) -> int:
         """Time of the last sample of any channel."""
         return max((int(t_ns[-1]) for t_ns in self.clocks().values()), default=self.start_ns)

@@ -150,8 +150,7 @@ def check_log(recording: Recording) -> None:
 
 def reference_of(recording: Recording) -> str:
     """ "truth", "held-out fixes", or "none"."""
-    listed = recording.truth_channels
-    if recording.truth is not None and len(recording.truth) and (not listed or "position" in listed):
+    if recording.truth_holds("position"):
         return "truth"
     return "held-out fixes" if recording.gnss is not None and len(recording.gnss) else "none"
 

@@ -45,8 +45,7 @@ def aided_by_truth(recording: Recording, seed: int) -> Recording:
         DataError: the truth holds no positions.
     """
     truth = recording.truth
-    listed = recording.truth_channels
-    if truth is None or not len(truth) or (listed and "position" not in listed):
+    if truth is None or not recording.truth_holds("position"):
         raise DataError("the truth holds no positions to simulate fixes from", channel="truth")
     known = np.flatnonzero(np.isfinite(truth.position_m[:, :2]).all(axis=1))
     rows = known[_thinned(truth.t_ns[known], 1.0 / AID_HZ)]

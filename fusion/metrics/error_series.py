@@ -86,12 +86,12 @@ def errors_against_truth(estimate: Estimate, recording: Recording, antenna: Ante
     The denser of the two is interpolated at the times of the sparser, except inside gaps. Only channels
     listed in `truth_channels`, if any, are used.
     """
-    truth, listed = recording.truth, set(recording.truth_channels)
+    truth, holds = recording.truth, recording.truth_holds
     if truth is None or len(truth) < 2 or len(estimate.trajectory) < 2:
         return None
-    has_position = not listed or "position" in listed
-    has_yaw = truth.quaternion is not None and bool(not listed or listed & {"yaw", "orientation"})
-    has_velocity = truth.twist_body is not None and (not listed or "velocity" in listed)
+    has_position = holds("position")
+    has_yaw = truth.quaternion is not None and (holds("yaw") or holds("orientation"))
+    has_velocity = truth.twist_body is not None and holds("velocity")
     rows = np.isfinite(truth.position_m[:, :2]).all(axis=1) if has_position else np.ones(len(truth), bool)
     truth = truth.select(rows)
     t_ns = _common_times(estimate.trajectory.t_ns, truth.t_ns)

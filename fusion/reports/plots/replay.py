@@ -137,8 +137,7 @@ def plot_speeds(
         rows = style.thin(len(speed))
         t = sheet.seconds(gnss.t_ns)[rows]
         plot.dots(t, speed[rows], "GNSS (absolute)", colours["gnss_velocity"], size=3.0)
-    listed = recording.truth_channels
-    if truth is not None and truth.twist_body is not None and (not listed or "velocity" in listed):
+    if truth is not None and truth.twist_body is not None and recording.truth_holds("velocity"):
         speed, t = truth.twist_body[:, 0], sheet.seconds(truth.t_ns)
         plot.line(t, speed, "truth", style.TRUTH_ON_ANY, width=2.4, alpha=0.6)
     path = estimate.trajectory

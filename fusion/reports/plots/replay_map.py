@@ -177,7 +177,7 @@ def _references(
         _fixes(plot, given.enu_m[rejected], "GNSS rejected", style.HELD_OUT, "x", len(given))
     if held_out is not None:
         _fixes(plot, held_out.enu_m, "GNSS held out", style.HELD_OUT, "ring", 400)
-    if truth is not None and len(truth) and "position" in (recording.truth_channels or ("position",)):
+    if truth is not None and recording.truth_holds("position"):
         place = truth.position_m
         plot.line(place[:, 0], place[:, 1], "truth", style.TRUTH_ON_ANY, dash="dashed", most=MOST)
 
