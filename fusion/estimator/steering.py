@@ -64,6 +64,19 @@ def steered_turn(rig: Rig, inputs: SensorConfig) -> SteeredTurn | None:
     return SteeredTurn(rig, rig.steering, inputs.steering_wheel, by_gyro=inputs.yaw == "gyro")
 
 
+def along(increment: WheelIncrement, course_rad: float) -> WheelIncrement:
+    """The increment of wheels that roll at an angle to the body's x axis, as front and rear wheels that turn
+    to one side do; its distance is that along the axis.
+    """
+    c, s = math.cos(course_rad), math.sin(course_rad)
+    x, y, z = increment.displacement_m.tolist()
+    moved = np.array([c * x - s * y, s * x + c * y, z])
+    change = c * increment.speed_change_mps
+    return dataclasses.replace(
+        increment, displacement_m=moved, distance_m=c * increment.distance_m, speed_change_mps=change
+    )
+
+
 class SteeredTurn:
     """Turns from steering angles.
 
@@ -95,6 +108,7 @@ class SteeredTurn:
         Where the angles are the only source of yaw, they are in the link of the keyframes, and not here.
         """
         dt_s = (end_ns - start_ns) * 1e-9
+        increment = along(increment, steering.course_rad(start_ns, end_ns))
         if not self._by_gyro:
             return self.applied(increment, None, dt_s, 0.0)
         rate_sigma = math.sqrt(covariance[BIAS, BIAS][5, 5])

@@ -9,6 +9,7 @@ Height follows GNSS, or stays at its start.
 """
 
 import dataclasses
+import math
 
 import gtsam
 import numpy as np
@@ -90,7 +91,7 @@ def with_wheel_acceleration(segments: list[ImuSegment], accel_mps2: float) -> li
 def yaw_of_wheels(wheels: WheelStream, track_m: float, steering: SteeringStream | None = None) -> Array:
     """Angular rate (3,) between the wheels' last two samples, rad/s; x and y are NaN.
 
-    It is their difference over the track or, with `steering`, their mean times the path's curvature.
+    It is their difference over the track or, with `steering`, their mean ahead times the path's curvature.
     """
     rate = 0.0
     if len(wheels.t_ns) > 1 and wheels.t_ns[-1] > wheels.t_ns[-2]:
@@ -99,7 +100,8 @@ def yaw_of_wheels(wheels: WheelStream, track_m: float, steering: SteeringStream 
         if steering is None:
             rate = (right - left) / track_m / dt
         else:
-            rate = 0.5 * (left + right) * (steering.curvature_per_m(*wheels.t_ns[-2:]) or 0.0) / dt
+            ahead = 0.5 * (left + right) * math.cos(steering.course_rad(*wheels.t_ns[-2:]))
+            rate = ahead * (steering.curvature_per_m(*wheels.t_ns[-2:]) or 0.0) / dt
     return np.array([np.nan, np.nan, rate])
 
 

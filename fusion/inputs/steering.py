@@ -1,4 +1,4 @@
-"""Curvature of the path by the steering angles."""
+"""Curvature and course of the path by the steering angles."""
 
 import bisect
 import math
@@ -14,6 +14,8 @@ LONGEST_HOLD_S = 1.0
 class SteeringStream:
     """Steering angles over time, as the curvature (tan front - tan rear) / wheelbase of the bicycle model.
 
+    The point that follows the wheels (`Rig.ahead_m`) moves (tan front + tan rear) / 2 to the left per metre
+    ahead, or tan rear where it is the middle of the rear axle.
     Angles that no wheel has are left out; `impossible` counts them.
     """
 
@@ -22,7 +24,8 @@ class SteeringStream:
         self.impossible = 0
         self.t_ns: list[int] = []
         self.per_m: list[float] = []
-        self._wheelbase_m = rig.wheelbase_m
+        self.course: list[float] = []
+        self._wheelbase_m, self._by_rear = rig.wheelbase_m, rig.ahead_m > 0.0
 
     def add(self, t_ns: int, front_rad: float, rear_rad: float = 0.0) -> None:
         """Mean angle of the front and of the rear wheels, rad, positive to the left.
@@ -37,23 +40,34 @@ class SteeringStream:
         if not max(abs(front_rad), abs(rear_rad)) < 0.5 * math.pi:
             self.impossible += 1
             return
-        per_m = (math.tan(front_rad) - math.tan(rear_rad)) / self._wheelbase_m
-        for at_ns, value in self.late.jump.admitted((t_ns, per_m)):
+        front, rear = math.tan(front_rad), math.tan(rear_rad)
+        sample = t_ns, (front - rear) / self._wheelbase_m, rear if self._by_rear else 0.5 * (front + rear)
+        for at_ns, per_m, course in self.late.jump.admitted(sample):
             for _ in range(self.late.from_future(at_ns, self.t_ns)):
-                self.t_ns.pop()
-                self.per_m.pop()
+                for values in (self.t_ns, self.per_m, self.course):
+                    values.pop()
             i = self.late.place(at_ns, self.t_ns)
             if i is not None:
                 self.t_ns.insert(i, at_ns)
-                self.per_m.insert(i, value)
+                self.per_m.insert(i, per_m)
+                self.course.insert(i, course)
 
     def curvature_per_m(self, start_ns: int, end_ns: int) -> float | None:
         """Mean curvature between two times, 1/m; None where no angle is near."""
-        values = [self._at(t) for t in (start_ns, (start_ns + end_ns) // 2, end_ns)]
-        known = [value for value in values if value is not None]
+        return self._mean(self.per_m, start_ns, end_ns)
+
+    def course_rad(self, start_ns: int, end_ns: int) -> float:
+        """Mean angle from the body's x axis to that point's velocity, positive to the left; 0 where no angle
+        is near.
+        """
+        return math.atan(self._mean(self.course, start_ns, end_ns) or 0.0)
+
+    def _mean(self, values: list[float], start_ns: int, end_ns: int) -> float | None:
+        found = [self._at(values, t) for t in (start_ns, (start_ns + end_ns) // 2, end_ns)]
+        known = [value for value in found if value is not None]
         return sum(known) / len(known) if known else None
 
-    def _at(self, t_ns: int) -> float | None:
+    def _at(self, values: list[float], t_ns: int) -> float | None:
         """Linear between samples; the last one holds."""
         i = bisect.bisect_right(self.t_ns, t_ns)
         if i == 0:
@@ -61,14 +75,14 @@ class SteeringStream:
         before_ns = self.t_ns[i - 1]
         hold_s = max(LONGEST_HOLD_S, 3e-9 * (before_ns - self.t_ns[i - 2]) if i > 1 else 0.0)
         if i == len(self.t_ns):
-            return self.per_m[-1] if (t_ns - before_ns) * 1e-9 <= hold_s else None
+            return values[-1] if (t_ns - before_ns) * 1e-9 <= hold_s else None
         if (self.t_ns[i] - before_ns) * 1e-9 > hold_s:
             return None
         share = (t_ns - before_ns) / (self.t_ns[i] - before_ns)
-        return self.per_m[i - 1] + share * (self.per_m[i] - self.per_m[i - 1])
+        return values[i - 1] + share * (values[i] - values[i - 1])
 
     def forget(self, before_ns: int) -> None:
         """Drop angles older than `before_ns`, in blocks so that it stays cheap."""
         i = bisect.bisect_left(self.t_ns, before_ns)
         if i > 256:
-            del self.t_ns[:i], self.per_m[:i]
+            del self.t_ns[:i], self.per_m[:i], self.course[:i]

@@ -85,6 +85,17 @@ def test_the_turn_has_a_sigma_that_covers_what_is_unknown() -> None:
     assert middle.displacement_m[1] == 0.0
 
 
+@pytest.mark.parametrize(("drive", "moved"), [("four_wheel_steer", 0.3), ("ackermann", 0.0)])
+def test_wheels_that_all_turn_to_one_side_move_the_robot_aslant(drive: str, moved: float) -> None:
+    own = rig(drive)
+    stream = SteeringStream(own)
+    for k in range(3):
+        stream.add(k * S // 10, 0.3, moved)
+    out = SteeredTurn(own, SPEC).between(0, S // 10, increment(0.1, 0.0), stream, np.zeros((30, 30)))
+    assert out.displacement_m[:2] == pytest.approx(0.1 * np.array([np.cos(moved), np.sin(moved)]))
+    assert out.distance_m == pytest.approx(0.1 * np.cos(moved))
+
+
 def test_a_steered_robot_does_not_skid_to_turn() -> None:
     policy = load_policy()
     assert policy_of(load_vehicle("elevate").rig(), policy) is policy
