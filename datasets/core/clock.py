@@ -24,6 +24,8 @@ NEAR_ROWS = 25
 """Intervals on either side of a step whose median is the nominal interval."""
 DISORDER_ROWS = 50
 """Rows out of order over a longer stretch did not merely arrive late."""
+SHUFFLED_SHARE = 0.1
+"""Share of intervals that run back from which all rows around arrived out of order (assumed)."""
 MARGIN_ROWS = 5
 """Periods before and after a stretch that count as part of it."""
 SHARED_ROWS = 3
@@ -171,6 +173,9 @@ def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
     start, stop = max(row - DISORDER_ROWS, 0), min(row + DISORDER_ROWS, len(t_ns))
     t, at = t_ns[start:stop] - t_ns[row], row - start
     steady = np.diff(t)
+    if (steady < 0).mean() > SHUFFLED_SHARE:  # between neighbours in the file is not the period
+        steady = np.diff(np.sort(t))
+        period = float(np.median(steady))
     steady = steady[np.abs(steady - period) < 0.5 * period]
     if steady.size:  # over many rows the mean is exact, the error of the median adds up
         period = float(steady.mean())

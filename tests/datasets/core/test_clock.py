@@ -101,12 +101,13 @@ def test_the_period_is_that_of_the_place() -> None:
 
 
 @settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 10**6), reach=st.integers(1, 20))
-def test_disorder_is_sorted_not_shifted(seed: int, reach: int) -> None:
-    """Rows that arrive up to `reach` periods late, among others in time."""
+@given(seed=st.integers(0, 10**6), reach=st.integers(1, 20), share=st.sampled_from([0.05, 1.0]))
+@example(seed=0, reach=5, share=1.0)
+def test_disorder_is_sorted_not_shifted(seed: int, reach: int, share: float) -> None:
+    """A share of the rows arrives up to `reach` periods late, the others in time."""
     rng = np.random.default_rng(seed)
     t = ticks()
-    late = np.arange(len(t)) + np.where(rng.random(len(t)) < 0.05, rng.uniform(0, reach, len(t)), 0)
+    late = np.arange(len(t)) + np.where(rng.random(len(t)) < share, rng.uniform(0, reach, len(t)), 0)
     arrived = t[np.argsort(late, kind="stable")]
     repaired, jumps = repair(arrived, "imu")
     assert jumps == ()
