@@ -80,6 +80,8 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
     *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
     (r"v|vel|velocity|speed|wheel_speed", "wheels", ("speed_mps",)),
+    (r"steer(?:ing)?_wheel(?:_angle)?", "steering", ("steering_wheel_rad",)),
+    (r"steer(?:ing)?(?:_angle)?", "steering", ("angle_rad",)),
     *(
         (_beside("i|cur|current|motor_current", _SIDES[side]), "motor", (f"{side}_a",))
         for side in ("left", "right")
@@ -152,7 +154,7 @@ def _guess(header: _Header) -> tuple[str, str] | None:
     """Channel and field that a column may stand for."""
     for channel, fields in FIELDS.items():
         own = header.column in fields and header.column not in TEXT_FIELDS  # whose codes no name tells
-        if own and channel in ("imu", "wheels", "gnss", "motor"):
+        if own and channel in ("imu", "wheels", "gnss", "motor", "steering"):
             return channel, header.column
     for pattern, channel, fields in _PATTERNS:
         if not re.fullmatch(pattern, header.base):
@@ -187,7 +189,9 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     for channel, needed in (("gnss", ("latitude_deg", "east_m")), ("truth", ("x_m",))):
         if not set(needed) & set(found.get(channel, {})):
             found.pop(channel, None)
-    gnss, wheels = found.get("gnss", {}), found.get("wheels", {})
+    gnss, wheels, steering = (found.get(channel, {}) for channel in ("gnss", "wheels", "steering"))
+    if "angle_rad" in steering:
+        found["steering"] = {"angle_rad": steering["angle_rad"]}
     if "latitude_deg" in gnss:
         found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())

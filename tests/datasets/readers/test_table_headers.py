@@ -8,6 +8,7 @@ import pytest
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.text.proposed_map import starter_map
 from tests.datasets.readers.test_table import GYRO_MAP, table
 
 HEADERS = {
@@ -52,6 +53,17 @@ def test_the_proposed_map_reads_units_in_headers(tmp_path: Path, case: str) -> N
     if "quality" in header:
         assert recording.gnss.fix.tolist() == [Fix.FIXED]
     assert any("decimal commas" in note for note in recording.notes) == (case == "decimal commas")
+
+
+@pytest.mark.parametrize(
+    ("names", "field"),
+    [("steer_deg", "angle_rad"), ("SteeringWheelAngle [deg],steering_angle [deg]", "angle_rad"),
+     ("SteeringWheelAngle [deg]", "steering_wheel_rad")],
+)  # fmt: skip
+def test_steering_is_proposed_by_its_name(names: str, field: str) -> None:
+    column = names.split(",")[-1]
+    expected = f'steering: {{{field}: {{column: "{column}", unit: deg}}}}'
+    assert expected in starter_map(["time", "speed", *names.split(",")])
 
 
 def test_ticks_are_proposed_as_angles_with_a_scale(tmp_path: Path) -> None:
