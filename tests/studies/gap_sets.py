@@ -323,6 +323,13 @@ def certainty(sets: Sequence[Mapping[str, Any]], head: Head) -> Reliability:
     return reliability(stated, true)
 
 
+def certainty_text(found: Reliability) -> str:
+    """Calibration errors; none without a detected set of known cause."""
+    if found.ece is None or found.brier is None:
+        return "no set of known cause was detected"
+    return f"ECE {found.ece:.3f}, Brier {found.brier:.3f} of {found.count}"
+
+
 def main() -> None:
     """Make sets, fit the head, or score it."""
     parser = argparse.ArgumentParser(
@@ -350,8 +357,7 @@ def main() -> None:
     head = calibration_head() if given.command == "score" else train(sets)
     for name, rate in scores(sets, head).items():
         print(f"{name}: {rate.hits} of {rate.count}")
-    found = certainty(sets, head)
-    print(f"stated certainty against outcome: ECE {found.ece:.3f}, Brier {found.brier:.3f} of {found.count}")
+    print(f"stated certainty against outcome: {certainty_text(certainty(sets, head))}")
     if given.command == "train":
         numbers = "".join(f"{name}: {value:.3g}\n" for name, value in dataclasses.asdict(head).items())
         text = f"# Fitted to {len(sets)} sets by\n# python -m tests.studies.gap_sets train\n{numbers}"
