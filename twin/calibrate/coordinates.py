@@ -6,7 +6,6 @@ from typing import Self
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
-from terrafusion.twin.effects.catalogue import lookup
 
 PRIOR_FACTOR = 0.5
 """Sigma of the logarithm of a positive number by default (assumed): known to a factor of 1.65."""
@@ -47,8 +46,11 @@ class Coordinate:
     start: float
 
     @classmethod
-    def of(cls, name: str, quantity: Quantity, start: float, prior: Prior | None) -> Self:
-        """The coordinate of a number that stands at `start` in the model; without a prior that is the prior.
+    def of(
+        cls, name: str, quantity: Quantity, start: float, prior: Prior | None, typical: float | None = None
+    ) -> Self:
+        """The coordinate of a number that stands at `start` in the model; without a prior that is the prior,
+        as wide as an effect's `typical` size.
 
         Raises:
             ConfigError: a prior outside the number's range or without a width.
@@ -61,11 +63,11 @@ class Coordinate:
                 f"the prior {prior.value:g} +- {prior.sigma:g} of '{name}' is out of range",
                 remedy=f"give {quantity.allowed()} and a positive sigma",
             )
-        logarithmic = quantity.low >= 0.0 and value > 0.0 and start > 0.0
+        logarithmic = typical is None and quantity.low >= 0.0 and value > 0.0 and start > 0.0
         if prior is not None:
             scale = prior.sigma / value if logarithmic else prior.sigma
-        elif name.startswith("effects."):
-            scale = lookup(name.removeprefix("effects."))[1].scale
+        elif typical is not None:
+            scale = typical
         else:
             scale = PRIOR_FACTOR if logarithmic else PRIOR_SHARE * (quantity.high - quantity.low)
         return cls(name, quantity.unit, quantity.low, quantity.high, value, scale, logarithmic, start)

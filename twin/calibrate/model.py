@@ -17,7 +17,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import quantities
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
-from terrafusion.twin.effects.catalogue import parameters
+from terrafusion.twin.effects.catalogue import lookup, parameters
+from terrafusion.twin.effects.form import Parameter
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -60,6 +61,10 @@ class Model:
         for part in path.split("."):
             found = getattr(found, part)
         return float(found)
+
+    def parameter(self, key: str) -> Parameter:
+        """An effect's parameter by its key, with size and range of this robot."""
+        return lookup(key)[1].sized(self.vehicle.body.mass_kg, self.vehicle.wheel.radius_m)
 
     def full_names(self, name: str) -> list[str]:
         """The dotted names that a name stands for: `soil.` is every ground."""
@@ -118,7 +123,8 @@ def resolve(names: tuple[str, ...], model: Model) -> dict[str, Quantity]:
     vehicle = {f"vehicle.{k}": q for k, q in quantities(VehicleParams).items()}
     soil = quantities(SoilParams)
     known = vehicle | {f"{s}.{k}": q for s in model.soils for k, q in soil.items()}
-    known |= {f"effects.{k}": Quantity(p.unit, p.low, p.high) for k, (_, p) in parameters().items()}
+    sized = {key: model.parameter(key) for key in parameters()}
+    known |= {f"effects.{key}": Quantity(p.unit, p.low, p.high) for key, p in sized.items()}
     found: dict[str, Quantity] = {}
     for name in names:
         for one in model.full_names(name):

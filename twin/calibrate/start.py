@@ -92,7 +92,8 @@ def coordinates_of(names: str | Sequence[str], model: Model, priors: Mapping[str
         raise ConfigError(
             f"a prior is given for '{min(unknown)}', which is not calibrated", remedy="name it, too"
         )
-    return [Coordinate.of(n, q, model.value(n), full.get(n)) for n, q in numbers.items()]
+    typical = {n: model.parameter(key).scale for n in numbers if (key := n.removeprefix("effects.")) != n}
+    return [Coordinate.of(n, q, model.value(n), full.get(n), typical.get(n)) for n, q in numbers.items()]
 
 
 def refuse_bypassed(coordinates: Sequence[Coordinate], logs: Sequence[PreparedLog]) -> None:

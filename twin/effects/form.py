@@ -7,8 +7,8 @@ it was given; a graph made without the parameter does not contain the term.
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.physics.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS, WHEELS
@@ -84,6 +84,12 @@ class Parameter:
     high: float
     name: str = ""
     grows: bool = False
+
+    def sized(self, mass_kg: float, radius_m: float) -> Self:
+        """With size and range of a robot of this mass and wheel radius."""
+        factor = mass_kg * radius_m / (NOMINAL_KG * NOMINAL_RADIUS_M) if self.grows else 1.0
+        numbers = {name: factor * getattr(self, name) for name in ("scale", "low", "high")}
+        return replace(self, **numbers)
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,7 +162,7 @@ FORMS = (
         "supply times exp(-e E / 10 kJ), E drawn so far", "ours",
     ),
     Form(
-        "drivetrain_friction", "coulomb", one("N m", 0.3, 0.0, 5.0),
+        "drivetrain_friction", "coulomb", (Parameter("N m", 0.3, 0.0, 5.0, grows=True),),
         {"wheel": lambda q, e: braked(q, e * ca.tanh(q["wheel_speed"] / FRICTION_SPEED_RADPS))},
         "torque e tanh(w / 0.1 rad/s) against rotation, each wheel", "Coulomb, smoothed",
     ),

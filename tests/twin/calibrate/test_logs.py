@@ -14,6 +14,7 @@ from terrafusion.twin.calibrate import solver
 from terrafusion.twin.calibrate.calibrate import calibrate
 from terrafusion.twin.calibrate.files import write_files
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.start import coordinates_of
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -75,6 +76,15 @@ def test_an_effect_is_a_parameter(tmp_path) -> None:
     assert np.max(np.abs(scores(found, truth))) < 3.5
     write_files(found, tmp_path, "elevate")
     assert load_vehicle(tmp_path / "vehicle.yaml").effects == {key: found[f"effects.{key}"].value}
+
+
+def test_friction_of_a_heavy_robot_is_sought_in_proportion_to_its_weight_and_wheels() -> None:
+    name = "effects.drivetrain_friction/coulomb"
+    light, heavy = (Model(load_vehicle(v), {SOIL: load_soil(SOIL)}) for v in ("elevate", "warthog"))
+    one, other = (coordinates_of(name, model, {})[0] for model in (light, heavy))
+    grown = 15.0  # 280 kg on wheels of 0.3 m, over 32 kg on wheels of 0.175 m
+    assert (other.high, other.scale) == pytest.approx((grown * one.high, grown * one.scale))
+    assert coordinates_of(name, heavy.replaced({name: 17.0}), {})[0].value(1.0) == 17.0 + other.scale
 
 
 @pytest.mark.parametrize("field", ["position_m", "quaternion"])

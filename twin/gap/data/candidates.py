@@ -13,7 +13,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import catalogue, forms_of, lookup, moves, parameters
-from terrafusion.twin.effects.form import NOMINAL_KG, NOMINAL_RADIUS_M, Form
+from terrafusion.twin.effects.form import Form
 from terrafusion.twin.model.vehicle import VehicleParams
 
 SOIL_STRENGTH = "soil_strength"
@@ -95,10 +95,9 @@ class Candidates:
 
     def sized_for(self, vehicle: VehicleParams) -> Self:
         """With typical sizes and ranges of a robot of this mass and wheel radius."""
-        known = parameters()
-        grown = vehicle.body.mass_kg * vehicle.wheel.radius_m / (NOMINAL_KG * NOMINAL_RADIUS_M)
-        factor = np.array([grown if known[key][1].grows else 1.0 for key in self.keys])
-        return replace(self, scale=factor * self.scale, low=factor * self.low, high=factor * self.high)
+        known = [lookup(key)[1].sized(vehicle.body.mass_kg, vehicle.wheel.radius_m) for key in self.keys]
+        scale, low, high = np.array([(p.scale, p.low, p.high) for p in known]).T
+        return replace(self, scale=scale, low=low, high=high)
 
     def beside(self, effects: Mapping[str, float]) -> Self:
         """As changes of a twin that has these effects already."""
