@@ -1,6 +1,8 @@
 """Vehicle files in their two forms: complete, or only what differs from another one (`robot`)."""
 
 import copy
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,22 @@ PLACES = {
     "imu_m": (IMU,),
 }
 """Numbers of the short form and their places in a complete file; the last one is the body's own."""
+INERTIA, SIZE = ("body", "yaw_inertia_kgm2"), ("mass_kg", "wheel_radius_m", "track_m")
+Powers = Mapping[tuple[str, ...], tuple[int, int, int]]
+RESIZED: Powers = {
+    INERTIA: (1, 0, 2),
+    ("body", "wheelbase_m"): (0, 0, 1),
+    ("body", "cg_height_m"): (0, 1, 0),
+    ("wheel", "width_m"): (0, 1, 0),
+    ("wheel", "inertia_kgm2"): (1, 2, 0),
+    ("drive", "no_load_speed_radps"): (0, -1, 0),
+    ("drive", "stall_torque_nm"): (1, 1, 0),
+    ("drive", "torque_limit_nm"): (1, 1, 0),
+    ("drive", "speed_loop_p_nms"): (1, 1, 0),
+    ("drive", "speed_loop_i_nm"): (1, 1, 0),
+}
+"""Numbers of the generic vehicle, and the powers of the numbers `SIZE` with which they grow: a robot of its
+shape, as fast, and as strong for its weight."""
 MEASURED = ("measured", "field log")
 """Beginnings of sources of numbers that were measured on the robot of the file."""
 
@@ -82,10 +100,7 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
     imu = out["sensors"]["imu"]
     imu |= {} if robot.imu_axes is None else {"axes": list(robot.imu_axes)}
     imu |= {} if robot.imu_frame is None else {"frame_id": robot.imu_frame}
-    if robot.mass_kg is not None:
-        inertia = out["body"]["yaw_inertia_kgm2"]
-        scaled = inertia["value"] * robot.mass_kg.number / out["body"]["mass_kg"]["value"]
-        inertia |= {"value": scaled, "source": f"derived: radius of gyration of '{robot.extends}'"}
+    _resize(out, robot, RESIZED if under == "generic" else {INERTIA: (1, 0, 0)})
     for name, places in PLACES.items():
         number = getattr(robot, name)
         if number is not None:
@@ -94,6 +109,24 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
     if numbers or "robot" in out:
         out["robot"] = {**out.get("robot", {}), **numbers}
     return out
+
+
+def _resize(out: dict[str, Any], robot: Robot, powers: Powers) -> None:
+    """Numbers that grow with the robot, as the vehicle below has them in proportion."""
+    given = [getattr(robot, name) for name in SIZE]
+    places = [PLACES[name][-1] for name in SIZE]
+    grown = [
+        1.0 if number is None else number.number / _at(out, place)["value"]
+        for number, place in zip(given, places, strict=True)
+    ]
+    for place, own in powers.items():
+        factor = math.prod(x**n for x, n in zip(grown, own, strict=True))
+        if factor != 1.0:
+            entry = _at(out, place)
+            entry |= {
+                "value": factor * entry["value"],
+                "source": f"derived: as of '{robot.extends}', in proportion to the robot",
+            }
 
 
 def _place(out: dict[str, Any], number: KnownNumber, places: tuple[tuple[str, ...], ...]) -> None:

@@ -145,15 +145,35 @@ def test_a_complete_file_says_in_its_source_that_the_antenna_is_measured(tmp_pat
     assert load_vehicle("husky").robot.antenna_m is None
 
 
+def test_what_a_short_file_leaves_out_is_in_proportion_to_the_robot(tmp_path: Path) -> None:
+    generic, husky = load_vehicle("generic"), load_vehicle("husky")
+    text = (
+        "robot:\n  mass_kg: {value: 120.0, known: measured, sigma: 1.0}\n"
+        "  wheel_radius_m: {value: 0.33, known: measured}\n"
+    )
+    large = load_vehicle(
+        written(tmp_path / "large.yaml", f"{text}  track_m: {{value: 1.1, known: measured}}\n")
+    )
+    assert large.body.yaw_inertia_kgm2 == pytest.approx(3.0 * 4.0 * generic.body.yaw_inertia_kgm2)
+    assert large.drive.torque_limit_nm == pytest.approx(6.0 * generic.drive.torque_limit_nm)
+    assert large.wheel.inertia_kgm2 == pytest.approx(12.0 * generic.wheel.inertia_kgm2)
+    assert large.drive.gear_ratio == generic.drive.gear_ratio
+    top_mps = [v.drive.no_load_speed_radps * v.wheel.radius_m for v in (large, generic)]
+    assert top_mps[0] == pytest.approx(top_mps[1])
+    loaded = load_vehicle(
+        written(tmp_path / "husky.yaml", text.replace("robot:", "robot:\n  extends: husky"))
+    )
+    assert loaded.drive == husky.drive  # a known robot keeps its own motors
+    assert loaded.body.yaw_inertia_kgm2 == pytest.approx(2.4 * husky.body.yaw_inertia_kgm2)
+
+
 def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path: Path) -> None:
     text = (
         "robot:\n  imu_axes: ['-z', '-x', '+y']\n  imu_frame: front_imu\n"
         "  mass_kg: {value: 80.0, known: measured, sigma: 1.0}\n"
     )
-    own, generic = load_vehicle(written(tmp_path / "own.yaml", text)), load_vehicle("generic")
+    own = load_vehicle(written(tmp_path / "own.yaml", text))
     assert (own.sensors.imu.axes, own.sensors.imu.frame_id) == (("-z", "-x", "+y"), "front_imu")
     assert own.body.mass_kg == 80.0
-    per_kg = generic.body.yaw_inertia_kgm2 / generic.body.mass_kg
-    assert own.body.yaw_inertia_kgm2 == pytest.approx(80.0 * per_kg)
     with pytest.raises(ConfigError, match="not a rotation"):
         load_vehicle(written(tmp_path / "bad.yaml", "robot: {imu_axes: ['+x', '+y', '-z']}\n"))
