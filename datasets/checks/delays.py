@@ -12,7 +12,6 @@ from terrafusion.datasets.checks.finding import (
     CheckContext,
     Finding,
     clocks_of,
-    counted,
     period_s,
     retimed,
     retiming,
@@ -22,6 +21,7 @@ from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.lag import Lag
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 
 LEAST_JUMP_S, JUMP_PERIODS, MOST_JUMPS = 0.3, 3.0, 4

@@ -139,8 +139,3 @@ def period_s(t_ns: TimesNs) -> float:
     steps = np.diff(t_ns)
     steps = steps[steps > 0]
     return float(np.median(steps)) * 1e-9 if steps.size else 1.0
-
-
-def counted(count: int, noun: str) -> str:
-    """Such as "1 gap", "3 gaps"."""
-    return f"{count} {noun}{'s' if count > 1 else ''}"

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, counted, scaled, without_rows
+from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, scaled, without_rows
 from terrafusion.datasets.checks.motion import cumulative, on_plane, runs, seconds, typical_sigma, wheel_speed
 from terrafusion.datasets.checks.path import antenna, dead_reckoned, scatter_m
 from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
-from terrafusion.datasets.core.printable import times
+from terrafusion.datasets.core.printable import counted, times
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, CLASS_SIGMA_M
 
 FROZEN_S = 3.0

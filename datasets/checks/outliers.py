@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, counted, without_rows
+from terrafusion.datasets.checks.finding import CheckContext, Finding, without_rows
 from terrafusion.datasets.checks.motion import ANY_RADIUS_M
 from terrafusion.datasets.checks.signals import SensorAxes, sensors_of, stuck_sensors, without_cells
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 
 CLIPPED_SHARE, CLIPPED_ROWS, PILE = 0.002, 10, 5.0

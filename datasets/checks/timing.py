@@ -12,7 +12,6 @@ from terrafusion.datasets.checks.finding import (
     Finding,
     changed,
     clocks_of,
-    counted,
     period_s,
     retimed,
     retiming,
@@ -20,6 +19,7 @@ from terrafusion.datasets.checks.finding import (
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.conventions import numbers_of, true_updates
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")

@@ -14,3 +14,8 @@ def printable(text: str) -> str:
 def times(count: int) -> str:
     """How often, in words: "once", "3 times"."""
     return "once" if count == 1 else f"{count} times"
+
+
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Such as "1 gap", "3 gaps"; a `plural` that ends otherwise is given."""
+    return f"{count} {noun}" if count == 1 else f"{count} {plural or noun + 's'}"

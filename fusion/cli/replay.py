@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.outputs import Output
@@ -149,7 +150,7 @@ def _shown(
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
     done = f"written to {out}"
     if grounds is not None and result.grounds is not None:
-        done += f"; {len(result.grounds)} grounds of '{result.grounds.robot}' to {grounds}"
+        done += f"; {counted(len(result.grounds), 'ground')} of '{result.grounds.robot}' to {grounds}"
     short = f"{result.verdict.lines()[0]}; {done}"
     return Result(lines, done, common.read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
 

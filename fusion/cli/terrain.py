@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result, add_command
 from terrafusion.fusion.cli.outputs import Output, parts_of
@@ -76,11 +77,11 @@ def train_on_logs(logs: list[str], vehicle: str | None, out: Path) -> Result:
 
     with progress("logs", len(logs)) as tick:
         runs = open_runs(logs, vehicle, tick)
-    made_by = f"terrafusion terrain train --out {out.name}, {len(runs)} runs"
+    made_by = f"terrafusion terrain train --out {out.name}, {counted(len(runs), 'run')}"
     model = train_on(runs, hashes_of(logs), made_by)
     write_model(model, out)
     windows = sum(len(r.route.windows) for r in runs)
-    done = f"{windows} windows of {len(runs)} runs on {', '.join(model.classes)}; written to {out}"
+    done = f"{windows} windows of {counted(len(runs), 'run')} on {', '.join(model.classes)}; written to {out}"
     document = {"out": str(out), "runs": len(runs), "windows": windows, "classes": list(model.classes)}
     return Result((), done, document)
 
@@ -139,7 +140,7 @@ def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out:
         runs = open_runs(logs, vehicle, tick)
     scores, spliced = cross_validated(runs) if loaded is None else (scores_on(loaded, runs), None)
     report = {**dataclasses.asdict(scores), "inputs": hashes_of(logs)}
-    lines = score_lines(f"{len(runs)} runs", scores)
+    lines = score_lines(counted(len(runs), "run"), scores)
     if spliced is not None:
         report["spliced"] = dataclasses.asdict(spliced)
         lines += score_lines("routes spliced from them", spliced)

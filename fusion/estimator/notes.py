@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from terrafusion.datasets.core.printable import times
+from terrafusion.datasets.core.printable import counted, times
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.inputs.time_jumps import JUMP_NS
@@ -43,15 +43,15 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         notes.append(level)
     if estimator.imu.spikes:
         notes.append(
-            f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "
-            "believed: the mean of those before stands for each"
+            f"{counted(estimator.imu.spikes, 'IMU sample')} beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} "
+            "m/s2 not believed: the mean of those before stands for each"
         )
     for name, count, what in (
         ("imu", estimator.imu.impossible, f"{MOST_RADPS:g} rad/s or {MOST_MPS2:g} m/s2"),
         ("wheels", estimator.wheels.impossible, f"{MOST_MPS:g} m/s"),
     ):
         if count:
-            notes.append(f"{count} samples of {name} beyond {what} were left out: no robot moves so")
+            notes.append(f"{counted(count, 'sample')} of {name} beyond {what} left out: no robot moves so")
     if estimator.wheels.noise.out_of_step:
         notes.append(
             "wheels: the counters are read out of step with their stamps; distances follow the speeds, and "
@@ -61,22 +61,23 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"wheels: the counters jumped {times(jumps)}; there the speeds gave the distance")
     if estimator.gyro.samples:
         notes.append(
-            f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "
-            "otherwise: the wheels stood in for it"
+            f"the gyro's yaw rate stood still for {counted(estimator.gyro.samples, 'sample')} while the "
+            "wheels turned otherwise: the wheels stood in for it"
         )
     for channel, ahead in estimator.newest.refused.items():
-        notes.append(f"{ahead} samples of {channel} lay far ahead of IMU and wheels: they were left out")
+        notes.append(f"{counted(ahead, 'sample')} of {channel} left out: far ahead of IMU and wheels")
     if dropped := estimator.fixes.dropped:
         notes.append(
-            f"{dropped} GNSS fixes lay more than {JUMP_NS * 1e-9:g} s ahead of IMU and wheels, and "
-            "of fixes that came after them: they were left out"
+            f"{counted(dropped, 'GNSS fix', 'GNSS fixes')} left out: more than {JUMP_NS * 1e-9:g} s ahead of "
+            "IMU and wheels, and of fixes that came later"
         )
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.jump.dropped:
             notes.append(
-                f"{stream.jump.dropped} samples of {stream.channel} lay more than {JUMP_NS * 1e-9:g} s ahead "
-                "of all others: they were left out"
+                f"{counted(stream.jump.dropped, 'sample')} of {stream.channel} left out: more than "
+                f"{JUMP_NS * 1e-9:g} s ahead of all others"
             )
         if stream.too_late:
-            notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
+            late = counted(stream.too_late, "sample")
+            notes.append(f"{late} of {stream.channel} came too late, with the keyframe made")
     return (*notes, *estimator.aids.notes())

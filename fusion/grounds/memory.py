@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
 
 PATCH_M = 25.0
@@ -55,7 +56,7 @@ class GroundMemory:
         lines = [
             f"  {g.name}: slip {float(g.motion.mean[0]):.2f}, {0.5 * g.windows:.0f} s" for g in self.grounds
         ]
-        return "\n".join([f"GroundMemory({self.robot!r}, {len(lines)} grounds)", *lines])
+        return "\n".join([f"GroundMemory({self.robot!r}, {counted(len(lines), 'ground')})", *lines])
 
     def __len__(self) -> int:
         return len(self.grounds)

@@ -7,6 +7,7 @@ import math
 import textwrap
 from pathlib import Path
 
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.effects.catalogue import forms_of
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
@@ -18,6 +19,7 @@ from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 WIDTH, LINES = 100, 24
 """Columns and lines of the screen that `answer` fits."""
 MOST_PLACES, MOST_NAMES, MOST_LISTED = 3, 4, 12
+END = 0.99  # share of a range from which a size is its end
 TITLE = 9  # columns of a section's title
 
 
@@ -109,16 +111,29 @@ def numbers(d: GapDiagnosis, cause: Cause) -> str:
     c, parts = d.evidence.candidates, []
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
         unit = f" {c.units[i]}" if c.units[i] else ""
-        within = (
-            f"+- {sigma * c.scale[i]:.2g}{unit}" if math.isfinite(sigma) else f"{unit} (fit failed)".strip()
-        )
-        parts.append(f"{c.keys[i]} = {value * c.scale[i]:.3g} {within}")
+        known = math.isfinite(sigma)
+        within = f"+- {_digits(sigma * c.scale[i], 2)}{unit}" if known else f"{unit} (fit failed)".strip()
+        end = ", the end of its range" if _at_end(d, i, value) else ""
+        parts.append(f"{c.keys[i]} = {_digits(value * c.scale[i], 3)} {within}{end}")
     return ", ".join(parts)
+
+
+def _at_end(d: GapDiagnosis, column: int, value: float) -> bool:
+    """Whether a size, in typical ones, is an end of its range."""
+    low, high = (END * end[0] for end in d.evidence.candidates.bounds((column,)))
+    return bool(value <= low < 0.0 or value >= high > 0.0)
+
+
+def _digits(value: float, count: int) -> str:
+    """A number with so many digits, and no power of ten below a million."""
+    text = f"{value:.{count}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def details(d: GapDiagnosis) -> list[str]:
     """What the screen leaves out: more places and ranked causes, the test, and assumptions."""
-    lines = [f"{len(d.runs)} run(s), {d.seconds:.0f} s; {len(d.references)} reference run(s); {_test(d)}"]
+    runs, references = counted(len(d.runs), "run"), counted(len(d.references), "reference")
+    lines = [f"{runs}, {d.seconds:.0f} s; {references}; {_test(d)}"]
     lines += [
         f"where: {place_words(c)}; {percent(c.share)} of the gap (p = {c.p_value:.2g})"
         for c in significant_places(d)[:MOST_LISTED]

@@ -6,6 +6,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.observations import sample_interval_s
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -131,8 +132,10 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     sides = side_speeds(limit_slew(wanted, DT_S, vehicle, first), vehicle)
     # Rare commands hold until the next one.
     gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
-    notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
-             "them is not compared, the last command is held"] if len(gaps) else []  # fmt: skip
+    notes = [
+        f"the commands have {counted(len(gaps), 'gap')} of up to {np.diff(gaps).max():.1f} s, in which "
+        "nothing is compared and the last command is held"
+    ] if len(gaps) else []  # fmt: skip
     return TwinInput(start, sides, False, gaps, tuple(notes), min(sample_interval_s(t_s), LONGEST_GAP_S))
 
 

@@ -105,7 +105,7 @@ def test_unknown_commands_are_a_hole_and_not_a_stop() -> None:
     v[100:300] = np.nan
     log = dataclasses.replace(drive(), command=dataclasses.replace(command, v_mps=v))
     found = calibrate(log, "elevate", SOIL, NAMES)
-    assert any("1 hole(s) of up to 4" in note for note in found.notes)
+    assert any("1 gap of up to 4" in note for note in found.notes)
     assert np.max(np.abs(scores(found, TRUTH))) < 3.5
     v[:] = np.nan
     with pytest.raises(DataError, match="not numbers"):
