@@ -73,14 +73,20 @@ class RobotOffsets:
         mean, covariance, _ = _posterior(references, self.scatter, prior)
         return RobotOffsets(mean, covariance, self.scatter, prior, len(references))
 
-    def left_out(self, references: Sequence[Score]) -> list[Array]:
-        """Mean (P,) by all the references but each, with the same scatter and prior."""
+    def left_out(self, references: Sequence[Score]) -> list[RobotOffsets]:
+        """What all the references but each know on their own drives, with the same scatter and prior."""
         own, parts = 1.0 / self.scatter, list[tuple[Array, Array]]()
         for r in references:
             H = inverse(r.A + np.diag(own))
             parts.append((np.diag(own) - own[:, None] * H * own, own * (H @ r.b)))
         known, gain = np.diag(1.0 / self.prior) + sum(k for k, _ in parts), sum(g for _, g in parts)
-        return [np.asarray(np.linalg.solve(known - k, gain - g)) for k, g in parts]
+        within = [inverse(known - k) for k, _ in parts]
+        return [
+            dataclasses.replace(
+                self, mean=C @ (gain - g), covariance=C, references=len(parts) - 1, changed=0.0
+            )
+            for C, (_, g) in zip(within, parts, strict=True)
+        ]
 
 
 def learn_offsets(
