@@ -19,6 +19,7 @@ from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 WIDTH, LINES = 100, 24
 """Columns and lines of the screen that `answer` fits."""
 MOST_PLACES, MOST_NAMES, MOST_LISTED = 3, 4, 12
+MOST_CANDIDATES = 10  # effects in a set beyond which it names none
 END = 0.99  # share of a range from which a size is its end
 TITLE = 9  # columns of a section's title
 
@@ -81,6 +82,8 @@ def verdict_line(d: GapDiagnosis) -> str:
         own = next(c.probability for c in verdict.causes if c.effect in verdict.named)
         certain = _certain(d, own)  # not of what it resembles
         return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
+    if (most := max(len(s.effects) for s in sets)) > MOST_CANDIDATES:
+        return f"Gap whose cause these drives do not show: any of {most} effects fits ({certain})."
     if len(sets) > 1:
         both = "; and ".join(map(alternatives_text, sets))
         return f"Gap caused by {len(sets)} effects together ({certain}): {both}."
@@ -190,6 +193,8 @@ def _places(d: GapDiagnosis, most: int) -> list[str]:
 def _which(d: GapDiagnosis, most: int) -> list[str]:
     """Sizes of the named effects; what they and their look-alikes are, and how to check them."""
     by_name = {cause.effect: cause for cause in d.verdict.causes}
+    if any(len(s.effects) > MOST_CANDIDATES for s in named_sets(d)):
+        return ["not shown by these drives: sizes and probabilities of all are in the report"]
     lines = [numbers(d, by_name[name]) for name in d.verdict.named]
     words = effect_words()
     names = list(dict.fromkeys(n for s in named_sets(d) for n in s.effects if n in words))

@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.diagnose import diagnose
 from tests.twin.gap.runs import runs
 from tests.twin.gap.test_diagnose import VEHICLE
@@ -32,3 +33,11 @@ def test_nonsense_is_refused(references: list[Recording]) -> None:
         diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
     with pytest.raises(ConfigError, match="significance"):
         diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)
+
+
+def test_channels_that_a_log_lacks_are_noted_as_left_out(references: list[Recording]) -> None:
+    bare = dataclasses.replace(references[1], gnss=None)
+    logs, _, notes = prepared([references[0], bare], VEHICLE, None)
+    assert [len(log.observed) for log in logs] == [len(logs[1].observed)] * 2
+    assert any("run101" in note and "gnss_east_m" in note for note in notes)
+    assert not any("left out" in note for note in prepared(references[:2], VEHICLE, None)[2])

@@ -55,6 +55,10 @@ def prepared(
     shared = [o.channel for o in logs[0].observed if all(o.channel in have for have in channels)]
     if not shared:
         raise DataError("the logs have no channel in common", remedy="diagnose logs of one robot")
+    left = [name for name in dict.fromkeys(c for have in channels for c in have) if name not in shared]
+    if left:
+        lacks = next(r.name for r, have in zip(recordings, channels, strict=True) if left[0] not in have)
+        notes = [*notes, f"left out of all logs, as some lack them (such as {lacks}): {', '.join(left)}"]
     in_common = [tuple(have[c] for c in shared) for have in channels]
     logs = [dataclasses.replace(log, observed=o) for log, o in zip(logs, in_common, strict=True)]
     return logs, model, notes

@@ -92,8 +92,12 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
         words[_words(cell, widths)] += n
     long = [name for name in words if words[name] >= LEAST_MISSING * judged.total()]
     order = sorted(long, key=lambda name: (-words[name], name))[:MOST_LISTED]
-    listed = tuple(f"{name} ({DT_S * words[name]:.0f} s)" for name in order)
+    listed = tuple(f"{name} ({_seconds(DT_S * words[name])} s)" for name in order)
     return DriveCoverage(1.0 - words.total() / max(judged.total(), 1), listed)
+
+
+def _seconds(time_s: float) -> str:
+    return f"{time_s:.0f}" if time_s >= 1.0 else f"{time_s:.1f}"
 
 
 def overlap(runs: Sequence[Array], references: Sequence[Array]) -> float:

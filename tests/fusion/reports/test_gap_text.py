@@ -1,0 +1,41 @@
+"""A diagnosis in words."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from terrafusion.fusion.reports.gap_text import numbers, verdict_line
+from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet, GapVerdict
+from terrafusion.twin.gap.data.candidates import Candidates
+
+
+def test_a_set_of_most_effects_names_none() -> None:
+    effects = Candidates.of().effects[:35]
+    verdict = GapVerdict(
+        "ambiguous", effects[:1], [], [CredibleSet(effects, 0.77, named=True)], 0.2, 0.0, None
+    )
+    answer: Any = SimpleNamespace(verdict=verdict, drives=None, uncalibrated=True)
+    expected = "Gap whose cause these drives do not show: any of 35 effects fits (77 % certain"
+    assert verdict_line(answer).startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "text"),
+    [
+        ("rate_dependent_shear", 1e3, "the end of its range"),
+        ("mud_adhesion", 1.0, "+- 640 Pa"),
+    ],
+)
+def test_sizes_say_where_their_range_ends_and_have_no_power_of_ten(
+    effect: str, value: float, text: str
+) -> None:
+    candidates = Candidates.of([effect])
+    at = candidates.hypotheses[0].columns
+    size = np.minimum(value, candidates.bounds(at)[1])
+    cause = Cause(effect, (effect,), 0.9, at, size, 640.0 / candidates.scale[list(at)], None)
+    answer: Any = SimpleNamespace(evidence=SimpleNamespace(candidates=candidates))
+    assert text in numbers(answer, cause)
