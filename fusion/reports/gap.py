@@ -90,7 +90,7 @@ def judge_rows(scores: Sequence[Compared]) -> list[dict[str, Any]]:
 def _tiles(d: GapDiagnosis) -> list[Tile]:
     """How sure it is that there is a gap, and what a named effect explains of it."""
     p, limit = d.detection.p_value, d.significance
-    tiles = [Tile("p of no gap", f"{p:.2g}", f"a gap below {limit:g}")]
+    tiles = [Tile("p-value", f"{p:.2g}", f"a gap below {limit:g}")]
     if named := named_sets(d):
         tiles.append(Tile("certain of the cause", percent(named[0].probability), alternatives_text(named[0])))
     elif d.verdict.kind == "unknown":

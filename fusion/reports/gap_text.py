@@ -9,7 +9,8 @@ from pathlib import Path
 
 from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.twin.effects.catalogue import forms_of
+from terrafusion.twin.effects.catalogue import forms_of, lookup
+from terrafusion.twin.effects.form import NOMINAL_KG, NOMINAL_RADIUS_M
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet
@@ -121,6 +122,13 @@ def numbers(d: GapDiagnosis, cause: Cause) -> str:
     return ", ".join(parts)
 
 
+def _law(d: GapDiagnosis, cause: Cause) -> str:
+    """The equation of a cause; where it has one parameter, its value is e."""
+    keys = d.evidence.candidates.keys
+    form, _ = lookup(keys[cause.columns[0]])
+    return form.equation + ("; e is the value" if len(form.parameters) == 1 else "")
+
+
 def _at_end(d: GapDiagnosis, column: int, value: float) -> bool:
     """Whether a size, in typical ones, is an end of its range."""
     low, high = (END * end[0] for end in d.evidence.candidates.bounds((column,)))
@@ -195,7 +203,7 @@ def _which(d: GapDiagnosis, most: int) -> list[str]:
     by_name = {cause.effect: cause for cause in d.verdict.causes}
     if any(len(s.effects) > MOST_CANDIDATES for s in named_sets(d)):
         return ["not shown by these drives: sizes and probabilities of all are in the report"]
-    lines = [numbers(d, by_name[name]) for name in d.verdict.named]
+    lines = [f"{numbers(d, by_name[name])} ({_law(d, by_name[name])})" for name in d.verdict.named]
     words = effect_words()
     names = list(dict.fromkeys(n for s in named_sets(d) for n in s.effects if n in words))
     lines += [f"{n}: {words[n][0]} To check: {words[n][1]}" for n in names[:most]]
@@ -272,7 +280,9 @@ def explanation(effect: str) -> list[str]:
         lines.append(f"  {form.key}: {form.equation} (source: {form.source})")
         for p in form.parameters:
             unit = f" {p.unit}" if p.unit else ""
+            robot = f"; for {NOMINAL_KG:g} kg on wheels of {NOMINAL_RADIUS_M:g} m, in proportion to both"
             lines.append(
                 f"    {form.parameter_key(p)}: typical {p.scale:g}{unit}, {p.low:g} to {p.high:g}{unit}"
+                + (robot if p.grows else "")
             )
     return lines

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.fusion.reports.gap_text import numbers, verdict_line
+from terrafusion.fusion.reports.gap_text import explanation, numbers, verdict_line
 from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet, GapVerdict
 from terrafusion.twin.gap.data.candidates import Candidates
 
@@ -39,3 +39,10 @@ def test_sizes_say_where_their_range_ends_and_have_no_power_of_ten(
     cause = Cause(effect, (effect,), 0.9, at, size, 640.0 / candidates.scale[list(at)], None)
     answer: Any = SimpleNamespace(evidence=SimpleNamespace(candidates=candidates))
     assert text in numbers(answer, cause)
+
+
+def test_sizes_that_grow_with_the_robot_say_for_which_they_are() -> None:
+    grows = [line for line in explanation("drivetrain_friction") if "in proportion" in line]
+    assert [line.split(":")[0].strip() for line in grows] == [
+        f"drivetrain_friction/{x}" for x in ("coulomb", "dry")
+    ]
