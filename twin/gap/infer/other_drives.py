@@ -82,9 +82,7 @@ class RobotOffsets:
         known, gain = np.diag(1.0 / self.prior) + sum(k for k, _ in parts), sum(g for _, g in parts)
         within = [inverse(known - k) for k, _ in parts]
         return [
-            dataclasses.replace(
-                self, mean=C @ (gain - g), covariance=C, references=len(parts) - 1, changed=0.0
-            )
+            dataclasses.replace(self, mean=C @ (gain - g), covariance=C, changed=0.0)
             for C, (_, g) in zip(within, parts, strict=True)
         ]
 
