@@ -311,7 +311,7 @@ class Estimator:
             slow_states.inflate_slip_covariance(self.chain, t_ns - SEEN_LATE_NS, dt, noise, *drift, switch)
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
-            segments = with_centripetal_force(segments, before, self.config.inputs.yaw == "steering")
+            segments = with_centripetal_force(segments, before)
         gap, turn = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns), None
         if gap and self.config.inputs.sides and self._turn is None:
             stretch = self.wheels.travelled(before_ns, t_ns), self.config.rig.track_m, dt

@@ -45,8 +45,6 @@ STEERED_TURN_SHARE, STEERED_YAW_DENSITY_RADPS = 0.1, 0.005
 STEERED_BIAS_SIGMA_RADPS, STEERED_BIAS_WALK = 0.05, 1e-3
 """Yaw rate of a robot that steers straight ahead, 1 sigma (0.02 rad off at a wheelbase in 0.4 s), and its
 walk, rad/s/sqrt(s), by changes of speed (assumed)."""
-STEERED_BIAS_FADES_MPS = 0.5
-"""Speed below which that rate falls to zero: a robot that stands does not turn (assumed)."""
 BIASED = ("gyro", "steering")
 """Sources of yaw whose bias is estimated."""
 UNKNOWN_YAW_DENSITY_RADPS = 0.5
@@ -62,23 +60,18 @@ def level_factor(k: int) -> gtsam.NonlinearFactor:
     return gtsam.AttitudeFactorPose3(X(k), _LEVEL, _TILT_NOISE, _LEVEL)
 
 
-def with_centripetal_force(
-    segments: list[ImuSegment], before: KeyState, steered: bool = False
-) -> list[ImuSegment]:
+def with_centripetal_force(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
     """The segments with the specific force of a level robot in a steady turn, sliding or not.
 
     It is perpendicular to the velocity: a force along it would speed up a robot that slides sideways.
-    With `steered`, yaw is that of steering angles, whose bias ends where the robot stands.
     """
     ahead, left = before.velocity @ before.rotation[:, :2]
     bias = float(before.bias.gyroscope()[2])
-    kept = bias * max(1.0 - math.hypot(ahead, left) / STEERED_BIAS_FADES_MPS, 0.0) if steered else 0.0
     out = []
     for segment in segments:
-        gyro = segment.gyro_radps + np.array([0.0, 0.0, kept])
-        rate = float(gyro[2]) - bias
+        rate = float(segment.gyro_radps[2]) - bias
         force = np.array([-rate * left, rate * ahead, GRAVITY_MPS2])
-        out.append(dataclasses.replace(segment, gyro_radps=gyro, accel_mps2=force))
+        out.append(dataclasses.replace(segment, accel_mps2=force))
     return out
 
 

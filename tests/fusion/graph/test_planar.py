@@ -281,15 +281,6 @@ def test_a_turn_adds_the_centripetal_force() -> None:
     np.testing.assert_allclose(force, [0.0, 2.0 * 0.3, GRAVITY_MPS2], atol=1e-12)
 
 
-@pytest.mark.parametrize(("speed_mps", "turns"), [(0.0, 0.0), (0.25, -0.05), (2.0, -0.1)])
-def test_the_bias_of_steering_angles_ends_where_the_robot_stands(speed_mps: float, turns: float) -> None:
-    segment = ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, GRAVITY_MPS2]))
-    state = _level_robot(speed_mps, 0.0, 0.1)
-    (steered,) = with_centripetal_force([segment], state, steered=True)
-    assert steered.gyro_radps[2] - 0.1 == pytest.approx(turns)
-    assert with_centripetal_force([segment], state)[0].gyro_radps[2] == 0.0
-
-
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(ahead=st.floats(-4.0, 4.0), left=st.floats(-4.0, 4.0), rate=st.floats(-2.5, 2.5))
 def test_a_turn_makes_no_energy(ahead: float, left: float, rate: float) -> None:
