@@ -121,7 +121,7 @@ def diagnose_evidence(
     detection = detect(scores, robot, candidates, seed)
     if detection.p_value <= significance and not uncalibrated:
         alone = [score(run, sigma) for run in judged.references]
-        detection = calibrated(detection, alone, robot, candidates, seed)
+        detection = calibrated(detection, len(runs), alone, robot, candidates, seed)
     explanation = explain(judged, sigma, robot, close=detection.p_value <= significance)
     if progress is not None:
         progress(0.9)

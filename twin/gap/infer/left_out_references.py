@@ -1,4 +1,4 @@
-"""The p-value of a gap, calibrated by those of the references, each judged by the others.
+"""The p-value of a gap, calibrated by those of references that are judged by the others.
 
 Without a gap -log p is exponential of mean one, if run and twin scatter as the test assumes. On a robot that
 scatters otherwise, references left out are unlikely, too: their mean is larger. It is known from a few of
@@ -14,20 +14,25 @@ from collections.abc import Sequence
 
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.detection import Detection, detect
-from terrafusion.twin.gap.infer.other_drives import RobotOffsets
+from terrafusion.twin.gap.infer.other_drives import FEWEST, RobotOffsets, groups
 from terrafusion.twin.gap.null.score import Score
 
 PRIOR_REFERENCES = 4.0  # weight of the test's own assumptions, in references (assumed)
 
 
 def calibrated(
-    found: Detection, references: Sequence[Score], robot: RobotOffsets, candidates: Candidates, seed: int
+    found: Detection,
+    runs: int,
+    references: Sequence[Score],
+    robot: RobotOffsets,
+    candidates: Candidates,
+    seed: int,
 ) -> Detection:
-    """The detection with a p-value as large as the references demand."""
-    others = [
-        detect([own], offsets, candidates, seed).p_value
-        for own, offsets in zip(references, robot.left_out(references), strict=True)
-    ]
+    """The detection in so many runs with a p-value as large as the references demand, which are judged by as
+    many together where enough others are left."""
+    together = min(runs, max(len(references) - FEWEST, 1))
+    judged = zip(groups(len(references), together), robot.left_out(references, together), strict=True)
+    others = [detect(references[group], offsets, candidates, seed).p_value for group, offsets in judged]
     return dataclasses.replace(found, p_value=predictive_tail(found.p_value, others))
 
 
