@@ -1,10 +1,14 @@
 """Tables as text, Markdown and HTML, and numbers in them. Cells are strings."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
+from typing import TYPE_CHECKING
 
-from terrafusion.datasets.core.arrays import TimesNs
+if TYPE_CHECKING:  # the command line imports this file first
+    from terrafusion.datasets.core.arrays import TimesNs
 
 Rows = Sequence[Sequence[str]]
 

@@ -22,7 +22,6 @@ from terrafusion.twin.gap.data.threads import one_blas_thread
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
-from terrafusion.twin.gap.infer.left_out_references import calibrated
 from terrafusion.twin.gap.infer.other_drives import FEWEST, SCATTER_SCALES, learn_offsets
 from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null.drives import drive_coverage
@@ -119,9 +118,6 @@ def diagnose_evidence(
         scores = [score(run, sigma) for run in judged.runs]
     # infer: is there a gap, and which effects explain it
     detection = detect(scores, robot, candidates, seed)
-    if detection.p_value <= significance and not uncalibrated:
-        alone = [score(run, sigma) for run in judged.references]
-        detection = calibrated(detection, len(runs), alone, robot, candidates, seed)
     explanation = explain(judged, sigma, robot, close=detection.p_value <= significance)
     if progress is not None:
         progress(0.9)

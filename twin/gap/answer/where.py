@@ -102,9 +102,9 @@ def out_of_sample(
     runs: Sequence[WhitenedRun], references: Sequence[WhitenedRun], sigma: Array, robot: RobotOffsets
 ) -> list[Array]:
     """Errors (n,) of judged runs and references less states and offsets, those that the other runs show."""
-    known = [robot] * len(runs) + robot.left_out([score(run, sigma) for run in references])
-    every = zip([*runs, *references], known, strict=True)
-    return [run.without_states(sigma, run.error - run.by_parameter @ own.mean) for run, own in every]
+    means = [robot.mean] * len(runs) + robot.left_out([score(run, sigma) for run in references])
+    every = zip([*runs, *references], means, strict=True)
+    return [run.without_states(sigma, run.error - run.by_parameter @ mean) for run, mean in every]
 
 
 def _p_values(

@@ -73,25 +73,14 @@ class RobotOffsets:
         mean, covariance, _ = _posterior(references, self.scatter, prior)
         return RobotOffsets(mean, covariance, self.scatter, prior, len(references))
 
-    def left_out(self, references: Sequence[Score], together: int = 1) -> list[RobotOffsets]:
-        """What the references but some know on their own drives, with the same scatter and prior: without the
-        first `together`, without those that follow, and so on."""
+    def left_out(self, references: Sequence[Score]) -> list[Array]:
+        """Mean (P,) by all the references but each, with the same scatter and prior."""
         own, parts = 1.0 / self.scatter, list[tuple[Array, Array]]()
         for r in references:
             H = inverse(r.A + np.diag(own))
             parts.append((np.diag(own) - own[:, None] * H * own, own * (H @ r.b)))
         known, gain = np.diag(1.0 / self.prior) + sum(k for k, _ in parts), sum(g for _, g in parts)
-        out = []
-        for group in groups(len(parts), together):
-            C = inverse(known - sum(k for k, _ in parts[group]))
-            mean = C @ (gain - sum(g for _, g in parts[group]))
-            out.append(dataclasses.replace(self, mean=mean, covariance=C, changed=0.0))
-        return out
-
-
-def groups(count: int, size: int) -> list[slice]:
-    """So many items in groups of one size; some may be left over."""
-    return [slice(i, i + size) for i in range(0, count - size + 1, size)]
+        return [np.asarray(np.linalg.solve(known - k, gain - g)) for k, g in parts]
 
 
 def learn_offsets(
