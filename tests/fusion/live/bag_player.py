@@ -7,6 +7,8 @@ import random
 import time
 from pathlib import Path
 
+from terrafusion.datasets.readers.ros import topics as known
+from terrafusion.datasets.readers.ros.arriving import KINDS
 from terrafusion.datasets.readers.ros.ros2 import open_container
 from terrafusion.fusion.live.dds import DdsBus
 
@@ -30,6 +32,11 @@ def messages_of(path: Path, skipped: tuple[str, ...] = ()) -> list[tuple[int, st
     return sorted(out, key=lambda one: one[0])
 
 
+def is_used(msgtype: str) -> bool:
+    """Whether a node subscribes to topics of this type, and would lose what is sent before."""
+    return any(msgtype in known.TYPES[kind] for kind in KINDS)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("bag", type=Path)
@@ -48,10 +55,11 @@ def main() -> None:
     bus = DdsBus(arguments.domain, loopback=True)
     types = {topic: msgtype for _, topic, msgtype, _ in found}
     ends = {topic: bus.advertise(topic, msgtype, topic in LATCHED) for topic, msgtype in types.items()}
-    deadline = time.monotonic() + 15.0
-    while not ends["/imu/data"].entity.get_matched_subscriptions() and time.monotonic() < deadline:
+    used = [ends[topic].entity for topic, msgtype in types.items() if is_used(msgtype)]
+    deadline = time.monotonic() + 30.0
+    while not all(end.get_matched_subscriptions() for end in used) and time.monotonic() < deadline:
         time.sleep(0.02)
-    time.sleep(0.3)  # the other topics
+    time.sleep(0.3)  # the subscriber learns of the match a little later
     begun = time.monotonic()
     for i, (t, topic, msgtype, cdr) in enumerate(found):
         due = begun + max(0.0, t - span[0]) * 1e-9 / arguments.speed
