@@ -157,6 +157,7 @@ class Robot(SensorNumbers):
     """Section `robot`: what differs from the vehicle that it `extends`, a name or a file beside this one.
 
     `imu_axes` are the sensor axes along body x, y, z; they turn a bag's messages in the frame `imu_frame`.
+    `gnss_sigma_m` is that of fixes that report none, horizontal; twice that upwards.
     """
 
     extends: str = "generic"
@@ -168,6 +169,7 @@ class Robot(SensorNumbers):
     wheelbase_m: Annotated[KnownNumber, Known(Quantity("m", 0.05, 5.0))] | None = None
     mass_kg: Annotated[KnownNumber, Known(Quantity("kg", 1.0, 5000.0))] | None = None
     imu_m: Place | None = None
+    gnss_sigma_m: Annotated[KnownNumber, Known(Quantity("m", 1e-3, 100.0))] | None = None
     imu_axes: tuple[str, ...] | None = None
     imu_frame: str | None = None
     topics: dict[str, str] = field(default_factory=dict)

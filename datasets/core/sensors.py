@@ -180,6 +180,8 @@ class Rig:
 
 
 UP_FACTOR = 2.0
+NO_SIGMA = "fixes have no sigma"
+"""What a note says of fixes whose sigma was assumed."""
 
 
 def with_assumed_sigma(
@@ -194,7 +196,7 @@ def with_assumed_sigma(
         return sigma, []
     filled = int(unknown[:, :2].any(axis=1).sum())
     assumed, origin = assumed_sigma(rig, fix, every)
-    return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes have no sigma; taken from {origin}"]
+    return np.where(unknown, assumed, sigma), [f"gnss: {filled} {NO_SIGMA}; taken from {origin}"]
 
 
 def assumed_sigma(

@@ -14,6 +14,7 @@ from terrafusion.datasets.checks.motion import runs
 from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import SMALL, is_firm
 from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.sensors import NO_SIGMA
 from terrafusion.fusion.estimate.estimate import STATUS
 from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
 from terrafusion.fusion.metrics.error_series import known_keyframes
@@ -55,6 +56,7 @@ SIGNIFICANT_Z = 3.0
 IN_A_ROW = 5
 """Fixes beyond the gate one after the other from which on they are no outliers but contradict: the chance of
 it, at a gate of 99.9 %, is 1e-15 for independent errors."""
+FAR_BELOW = 0.3  # innovations over their sigma below which an assumed sigma may be far too large
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
 CLEARLY_WORSE, CLEARLY_M, FAR_WORSE, FAR_WORSE_M = 1.5, 0.1, 2.0, 0.5
@@ -347,6 +349,11 @@ def _supports(run: Run) -> Iterator[str]:
             f"fixes agree with wheels and IMU: innovations are {np.mean(used) ** 0.5:.1f} times their sigma"
             f"{left_out}"
         )
+        if np.mean(used) ** 0.5 < FAR_BELOW and any(NO_SIGMA in note for note in run.recording.notes):
+            yield (
+                f"the fixes report no sigma, and {_fix_sigma_m(run.used):g} m was assumed: if the receiver "
+                "is better, give its `gnss_sigma_m` in the vehicle file"
+            )
 
 
 def _error_m(run: Run) -> float | None:

@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.errors import ConfigError, DataError
@@ -312,7 +312,13 @@ def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
 def listed_overrides(overrides: Overrides) -> str:
     """The geometry a log reports, in words."""
     values = dataclasses.asdict(overrides).items()
-    return ", ".join(f"{name} = {value}" for name, value in values if value is not None) or "none"
+    return ", ".join(f"{name} = {_in_words(value)}" for name, value in values if value is not None) or "none"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_in_words, value))}]"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:

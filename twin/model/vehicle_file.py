@@ -1,6 +1,7 @@
 """Vehicle files in their two forms: complete, or only what differs from another one (`robot`)."""
 
 import copy
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,10 +11,11 @@ from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.robot import KnownNumber, Robot, RobotFile, SensorNumbers
-from terrafusion.datasets.core.sensors import STEERED_DRIVES
+from terrafusion.datasets.core.sensors import STEERED_DRIVES, UP_FACTOR
 from terrafusion.twin.model.library import known_names, read_named
 
 ANTENNA, IMU = ("sensors", "gnss", "antenna_m"), ("sensors", "imu", "position_m")
+FLAT, UP = ("sensors", "gnss", "sigma_horizontal_m"), ("sensors", "gnss", "sigma_vertical_m")
 PLACES = {
     "wheel_radius_m": (("odometry", "wheel_radius_m"), ("wheel", "radius_m")),
     "track_m": (("odometry", "track_m"), ("body", "track_m")),
@@ -21,6 +23,7 @@ PLACES = {
     "antenna_m": (ANTENNA,),
     "mass_kg": (("body", "mass_kg"),),
     "imu_m": (IMU,),
+    "gnss_sigma_m": (FLAT,),
 }
 """Numbers of the short form and their places in a complete file; the last one is the body's own."""
 INERTIA, SIZE = ("body", "yaw_inertia_kgm2"), ("mass_kg", "wheel_radius_m", "track_m")
@@ -105,6 +108,10 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
         number = getattr(robot, name)
         if number is not None:
             _place(out, number, places)
+    if robot.gnss_sigma_m is not None:
+        _place(
+            out, dataclasses.replace(robot.gnss_sigma_m, value=UP_FACTOR * robot.gnss_sigma_m.number), (UP,)
+        )
     numbers = {name: raw[name] for name in SensorNumbers.__dataclass_fields__ if name in raw}
     if numbers or "robot" in out:
         out["robot"] = {**out.get("robot", {}), **numbers}
@@ -134,7 +141,7 @@ def _place(out: dict[str, Any], number: KnownNumber, places: tuple[tuple[str, ..
     for place in places:
         _at(out, place[:-1])[place[-1]] = {"value": value, "source": number.source}
     body = ".".join(places[-1])
-    if number.known in ("measured", "calibrated") and places[-1] not in (ANTENNA, IMU):
+    if number.known in ("measured", "calibrated") and places[-1][0] != "sensors":
         out["measured"] = sorted({*out.get("measured", ()), body})
 
 

@@ -352,3 +352,14 @@ def test_wild_fixes_that_were_rejected_do_not_count_as_agreement(drive):
     found = verdict(d, estimate=with_innovations(d, nis, accepted=nis < 1e3))
     assert found.value == "good", found
     assert found.reasons[1].endswith("innovations are 1.0 times their sigma; 2 of 100 were rejected.")
+
+
+@pytest.mark.parametrize(
+    ("nis", "reported", "asked"), [(0.05, False, True), (1.0, False, False), (0.05, True, False)]
+)
+def test_a_sigma_that_was_assumed_far_too_large_is_asked_for(drive, nis, reported, asked):
+    d = drive(offset_m=(0.1, 0.1), sigma_m=0.2)
+    notes = () if reported else ("gnss: 100 fixes have no sigma; taken from assumed by class",)
+    d = dataclasses.replace(d, recording=dataclasses.replace(d.recording, notes=notes))
+    found = verdict(d, estimate=with_innovations(d, np.full(100, 2.0 * nis)))
+    assert any("gnss_sigma_m" in reason for reason in found.reasons) == asked

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Overrides
+from terrafusion.datasets.core.sensors import assumed_sigma
 from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
 from terrafusion.twin.model.vehicle_file import read_vehicle
 from terrafusion.twin.simulate import simulate
@@ -54,6 +57,16 @@ def test_a_file_extends_one_beside_it_and_keeps_what_that_one_knows(tmp_path: Pa
     assert second.wheel.radius_m == 0.12
     assert second.robot.gyro_scale is not None
     assert second.robot.gnss_delay_s is not None
+
+
+def test_a_short_file_tells_the_sigma_of_a_receiver_that_reports_none(tmp_path: Path) -> None:
+    text = "robot:\n  gnss_sigma_m: {value: 0.02, known: data_sheet}\n"
+    own = load_vehicle(written(tmp_path / "own.yaml", text))
+    assert (own.sensors.gnss.sigma_horizontal_m, own.sensors.gnss.sigma_vertical_m) == (0.02, 0.04)
+    assert own.measured == ()
+    sigma, origin = assumed_sigma(own.rig(), np.array([Fix.SINGLE, Fix.SINGLE]))
+    assert sigma.tolist() == [[0.02, 0.02, 0.04]] * 2
+    assert "0.02 m" in origin
 
 
 def test_a_file_of_one_line_is_the_generic_vehicle(tmp_path: Path) -> None:
