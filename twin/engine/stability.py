@@ -21,11 +21,16 @@ DIFFERENCE = 1e-7  # of the states, for derivatives
 
 
 def stable_stages(step_s: float, plant: Plant) -> int:
-    """Stages of a Runge-Kutta-Chebyshev step with which the plant is stable at rest on all its soils."""
-    effects = tuple(sorted(plant.effects.items()))
-    rates = [_rate_at_rest(plant.vehicle.tobytes(), soil.tobytes(), effects) for soil in plant.route.soil]
-    fastest = MARGIN * step_s * max(rates)
+    """Stages of a Runge-Kutta-Chebyshev step with which the plant is stable at rest."""
+    fastest = MARGIN * step_s * fastest_rate(plant)
     return next((n for n in range(FEWEST, MOST) if reach(n) >= fastest), MOST)
+
+
+def fastest_rate(plant: Plant) -> float:
+    """Greatest rate of the plant at rest, 1/s, on all its soils."""
+    effects = tuple(sorted(plant.effects.items()))
+    soils = plant.route.soil
+    return max(_rate_at_rest(plant.vehicle.tobytes(), soil.tobytes(), effects) for soil in soils)
 
 
 @functools.lru_cache(maxsize=256)

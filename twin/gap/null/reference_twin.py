@@ -17,10 +17,11 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
+from terrafusion.twin.engine.stability import fastest_rate
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
-from terrafusion.twin.gap.rollout.batch import stages_of
 from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
     RunResiduals,
@@ -48,9 +49,9 @@ EFFECT_SIGMA = 0.1
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
 STEPS, TRIES, ENOUGH = 6, 4, 0.01
 """Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
-MOST_STAGES = 4
-"""Stages of the integration beyond which harder ground and stiffer motors than the given twin's are not
-tried: logs hardly tell them from softer ones, and all rollouts would take longer."""
+MOST_RATE = 910.0
+"""1/s: fastest rate at rest up to which harder ground and stiffer motors than the given twin's are tried:
+logs hardly tell stiffer ones apart, all rollouts would take longer, and fewer changes were detected."""
 DAMPING, LESS, MORE = 1.0, 1.0 / 6.0, 8.0
 """First damping, as a share of the information, and its factors after a step that is better, or is not."""
 
@@ -91,12 +92,11 @@ class _Fit:
         )
 
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or needs too
-        many stages."""
+        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or is too
+        stiff."""
         models, count = [self.model(w) for w in points], len(self.runs)
-        log = self.runs[0].log
-        most = max(MOST_STAGES, stages_of(log, self.cache.model))
-        soft = [stages_of(log, model) <= most for model in models]
+        given, *rates = (fastest_rate(plant_of(self.runs[0].log, m)) for m in (self.cache.model, *models))
+        soft = [rate <= max(MOST_RATE, given) for rate in rates]
         tried = [Rollout(r.log, {}, model=m) for m in itertools.compress(models, soft) for r in self.runs]
         found = iter(aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs))
         out = list[list[Array] | None]()

@@ -51,11 +51,6 @@ ABSENT_SHARE = 1e-12
 """Value of an absent effect, in typical sizes: so that all runs of a group share one compiled graph."""
 
 
-def stages_of(log: PreparedLog, model: Model) -> int:
-    """Stages of the integration that a twin needs."""
-    return stable_stages(DT_S / STEPS, plant_of(log, model))
-
-
 def effect_groups(candidates: Candidates) -> list[tuple[str, ...]]:
     """The nominal twin and the effects that change the motion, by shared graph."""
     keys = (NOMINAL, *candidates.moving)
@@ -136,7 +131,7 @@ def make_lanes(
         if (id(log), id(model)) not in bases:
             others = other_effects(model, candidates)
             bases[id(log), id(model)] = plant_of(log, dataclasses.replace(model, effects=others))
-            stages[id(log), id(model)] = stages_of(log, model)
+            stages[id(log), id(model)] = stable_stages(DT_S / STEPS, plant_of(log, model))
         base = bases[id(log), id(model)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
