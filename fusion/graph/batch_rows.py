@@ -198,7 +198,7 @@ class _Markov:
 
 
 class _Wheels:
-    """`wheel_factor.residual` and `jacobians` of many increments."""
+    """`wheel_factor.linearised` of many increments."""
 
     def __init__(self, increments: list[WheelIncrement | None]) -> None:
         known = [w for w in increments if w is not None]
@@ -274,7 +274,7 @@ def _first_rows(measurements: list[list[T]], used: Places) -> tuple[list[T], Pla
 
 
 class _Fixes:
-    """`gnss_factor.residual` and `jacobians` of many fixes."""
+    """`gnss_factor.linearised` of many fixes."""
 
     def __init__(self, fixes: list[list[GnssPosition]], used: Places) -> None:
         flat, self._at, self._row = _first_rows(fixes, used)
@@ -313,7 +313,7 @@ class _Fixes:
 
 
 class _Velocities:
-    """`velocity_factor.residual` and `jacobians` of many velocities."""
+    """`velocity_factor.linearised` of many velocities."""
 
     def __init__(self, measurements: list[list[GnssVelocity]], used: Places) -> None:
         flat, self._at, self._row = _first_rows(measurements, used)
@@ -321,7 +321,7 @@ class _Velocities:
             np.array([getattr(one, name) for one in flat]).reshape(-1, 3)
             for name in ("velocity_mps", "lever_m")
         )
-        self._lever_matrix = np.array([one.lever_matrix for one in flat]).reshape(-1, 3, 3)
+        self._by_lever = np.array([one.velocity_by_lever for one in flat]).reshape(-1, 3, 3)
         self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 3, 1)
 
     def fill(self, rows: Array, values: gtsam.Values, begin: int, R: Array, linear: Array) -> None:
@@ -332,13 +332,13 @@ class _Velocities:
         R, antenna = R[at], slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
         lever = self._lever.copy()
         lever[:, :2] += linear[at][:, antenna]
-        lever_velocity = np.einsum("kij,kj->ki", self._lever_matrix, lever)
+        lever_velocity = np.einsum("kij,kj->ki", self._by_lever, lever)
         velocity = np.array([values.atVector(V(begin + int(i))) for i in at])
         H = np.zeros((len(at), 3, dim + 1))
         H[:, :, :3] = np.cross(R, lever_velocity[:, None, :]) * -1.0  # -R skew(s), row by row
         H[:, :, VELOCITY] = np.eye(3)
         if dim >= ANTENNA.stop:
-            H[:, :, ANTENNA] = (R @ self._lever_matrix)[:, :, :2]
+            H[:, :, ANTENNA] = (R @ self._by_lever)[:, :, :2]
         H[:, :, -1] = self._velocity - velocity - np.einsum("kij,kj->ki", R, lever_velocity)
         place = (self._row[:, None] + np.arange(3))[:, :, None]
         rows[at[:, None, None], place, np.r_[0:dim, 2 * dim]] = H / self._sigma

@@ -12,7 +12,6 @@ lateness of the receiver's stamps while the antenna moves with v; both are state
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -50,16 +49,6 @@ class GnssPosition:
     delay_s: float = 0.0
 
 
-def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
-    """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
-    return _linearised(fix, pose.rotation().matrix(), pose.translation(), linear)[0]
-
-
-def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 15)."""
-    return _linearised(fix, pose.rotation().matrix(), pose.translation(), linear)[1:]
-
-
 def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
     """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
     out = np.zeros((3, dim + 1))
@@ -70,11 +59,10 @@ def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
 
 
 def linearised(fix: GnssPosition, at: KeyState) -> tuple[Array, Array, Array]:
-    """`residual` and `jacobians` at a keyframe's state."""
-    return _linearised(fix, at.rotation, at.pose.translation(), at.linear)
-
-
-def _linearised(fix: GnssPosition, R: Array, p: Array, linear: Array) -> tuple[Array, Array, Array]:
+    """The residual of the module's docstring, unwhitened, and its derivatives by the pose (3, 6; GTSAM
+    tangent) and by the linear states (3, 15).
+    """
+    R, p, linear = at.rotation, at.pose.translation(), at.linear
     lever = fix.lever_m.copy()
     lever[:2] += linear[_ANTENNA]
     drift = np.zeros(3)

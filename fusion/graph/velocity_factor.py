@@ -10,7 +10,6 @@ measured. In a calibration such priors would hold the velocity to the lever arm 
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -29,18 +28,13 @@ class GnssVelocity:
         velocity_mps: (3,) of the antenna, or of the body origin, world.
         sigma_mps: 1 sigma (3,), white; large along an axis that is not measured.
         lever_m: (3,) the antenna's place in the vehicle file, body.
-        velocity_by_lever: (3, 3), see `lever_arm_velocity`; None where the velocity is the body origin's.
+        velocity_by_lever: (3, 3), see `lever_arm_velocity`; zero where the velocity is the body origin's.
     """
 
     velocity_mps: Array
     sigma_mps: Array
     lever_m: Array = field(default_factory=lambda: np.zeros(3))
-    velocity_by_lever: Array | None = None
-
-    @property
-    def lever_matrix(self) -> Array:
-        """`velocity_by_lever`, zero where there is none."""
-        return np.zeros((3, 3)) if self.velocity_by_lever is None else self.velocity_by_lever
+    velocity_by_lever: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
@@ -52,31 +46,26 @@ def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
     return np.asarray(W + offset_s * W @ W)
 
 
-def residual(velocity: GnssVelocity, pose: Any, velocity_mps: Array, linear: Array) -> Array:
-    """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
-    lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
-    lever_velocity = pose.rotation().matrix() @ velocity.lever_matrix @ lever
-    return np.asarray(velocity_mps + lever_velocity - velocity.velocity_mps)
-
-
-def jacobians(velocity: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent), velocity (3, 3) and `linear` (3, 15)."""
-    R = pose.rotation().matrix()
-    lever = velocity.lever_m + np.append(linear[_ANTENNA], 0.0)
+def linearised(velocity: GnssVelocity, at: KeyState) -> tuple[Array, Array, Array]:
+    """The residual of the module's docstring, unwhitened, and its derivatives by the pose (3, 6; GTSAM
+    tangent) and by the linear states (3, 15); that by the velocity is one.
+    """
+    R, L = at.rotation, velocity.velocity_by_lever
+    lever = velocity.lever_m + np.append(at.linear[_ANTENNA], 0.0)
     H_pose, H = np.zeros((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))
-    H_pose[:, :3] = -R @ skew(velocity.lever_matrix @ lever)
-    H[:, _ANTENNA] = (R @ velocity.lever_matrix)[:, :2]
-    return H_pose, np.eye(3), H
+    H_pose[:, :3] = -R @ skew(L @ lever)
+    H[:, _ANTENNA] = (R @ L)[:, :2]
+    return at.velocity + R @ L @ lever - velocity.velocity_mps, H_pose, H
 
 
 def rows(velocity: GnssVelocity, point: KeyState, dim: int) -> Array:
     """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
     out = np.zeros((3, dim + 1))
-    if velocity.velocity_by_lever is None:
+    if not velocity.velocity_by_lever.any():
         out[_AXES, VELOCITY.start + _AXES] = 1.0 / velocity.sigma_mps
         out[:, dim] = (velocity.velocity_mps - point.velocity) / velocity.sigma_mps
         return out
-    H_pose, H_velocity, H_linear = jacobians(velocity, point.pose, point.linear)
-    out[:, POSE], out[:, VELOCITY], out[:, NAV.stop : dim] = H_pose, H_velocity, H_linear[:, : dim - NAV.stop]
-    out[:, dim] = -residual(velocity, point.pose, point.velocity, point.linear)
+    left, H_pose, H_linear = linearised(velocity, point)
+    out[:, POSE], out[:, VELOCITY], out[:, NAV.stop : dim] = H_pose, np.eye(3), H_linear[:, : dim - NAV.stop]
+    out[:, dim] = -left
     return out / velocity.sigma_mps[:, None]

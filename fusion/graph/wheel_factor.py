@@ -18,7 +18,7 @@ Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -97,36 +97,17 @@ def slip_of(linear: Array, wheels: WheelIncrement) -> float:
     return float(linear[_S]) + (asked_m / wheels.distance_m if abs(wheels.distance_m) > MOVED_M else 0.0)
 
 
-def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
-    """The residual (4,) of the module's docstring, unwhitened; `linear` (15,) of keyframe j."""
-    return _linearised(*_matrices(pose_i), *_matrices(pose_j), linear, wheels)[0]
-
-
-def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> tuple[Array, Array, Array]:
-    """Derivatives of `residual` by pose i (4, 6), pose j (4, 6) and the linear states (4, 15).
+def linearised(before: KeyState, now: KeyState, wheels: WheelIncrement) -> tuple[Array, Array, Array, Array]:
+    """The residual (4,) of the module's docstring, unwhitened, and its derivatives by the poses of both
+    keyframes (4, 6) and by the linear states of the second (4, 15).
 
     Pose tangents are GTSAM's: rotation first, both parts in the body frame.
     """
-    return _linearised(*_matrices(pose_i), *_matrices(pose_j), linear, wheels)[1:]
-
-
-def linearised(before: KeyState, now: KeyState, wheels: WheelIncrement) -> tuple[Array, Array, Array, Array]:
-    """`residual` and `jacobians` between two keyframes."""
-    p_i, p_j = before.pose.translation(), now.pose.translation()
-    return _linearised(before.rotation, p_i, now.rotation, p_j, now.linear, wheels)
-
-
-def _matrices(pose: Any) -> tuple[Array, Array]:
-    return pose.rotation().matrix(), pose.translation()
-
-
-def _linearised(
-    R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array, wheels: WheelIncrement
-) -> tuple[Array, Array, Array, Array]:
+    R_i, p_i, R_j, p_j = before.rotation, before.pose.translation(), now.rotation, now.pose.translation()
     moved, T = R_i.T @ (p_j - p_i), R_i.T @ R_j
     x, y, z = moved.tolist()
     (c, _, e), (s, g, h), (a, _, _) = T.tolist()
-    state = linear.tolist()
+    state = now.linear.tolist()
     slip, radius = 1.0 - state[_S], 1.0 + state[_R]
     rolled = wheels.displacement_m.copy()
     rolled[0] += state[_T] * wheels.speed_change_mps

@@ -24,9 +24,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.graph import gnss_factor
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import RobustTuning
 from terrafusion.fusion.weighting.weighting import (
@@ -113,8 +112,7 @@ class RobustWeighting(Weighting):
         """Squared horizontal residuals (n,), whitened by the fixes' own full-weight sigmas."""
         out = np.zeros(len(held))
         for i, (k, fix) in enumerate(held):
-            state = chain.state(k)
-            r = gnss_factor.residual(fix, state.pose, state.linear)[:2] / fix.sigma_m[:2]
+            r = linearised(fix, chain.state(k))[0][:2] / fix.sigma_m[:2]
             out[i] = float(r @ r) / fix.weight
         return out
 

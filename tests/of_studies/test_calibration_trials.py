@@ -15,7 +15,7 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import SURGE_SPEED_MPS, wheel_increment
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, KeyState
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement, residual, slip_of
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, linearised, slip_of
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import load_policy
@@ -148,9 +148,16 @@ def test_wheels_that_gain_speed_are_expected_to_outrun_the_robot(forwards: float
     assert increment(True).surge_m == pytest.approx(wanted)
     linear = np.zeros(len(LINEAR))
     linear[-1] = 0.5
-    start = gtsam.Pose3()
-    there = gtsam.Pose3(gtsam.Rot3(), np.array([forwards * 0.1 - 0.5 * wanted, 0.0, 0.0]))
-    assert residual(start, there, linear, increment(True)) == pytest.approx(np.zeros(4))
+    start, there = (
+        KeyState(
+            gtsam.Pose3(gtsam.Rot3(), np.array([x_m, 0.0, 0.0])),
+            np.zeros(3),
+            gtsam.imuBias.ConstantBias(),
+            linear,
+        )
+        for x_m in (0.0, forwards * 0.1 - 0.5 * wanted)
+    )
+    assert linearised(start, there, increment(True))[0] == pytest.approx(np.zeros(4))
 
 
 def test_a_fix_belongs_to_when_it_was_measured_as_far_as_the_delay_is_known() -> None:

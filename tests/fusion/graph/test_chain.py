@@ -10,7 +10,7 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gnss_factor, keyframe_rows, velocity_factor
+from terrafusion.fusion.graph import gnss_factor, keyframe_rows, velocity_factor, wheel_factor
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import markov_step
@@ -18,7 +18,7 @@ from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from tests import gtsam_factors
 
 Array = NDArray[np.float64]
@@ -280,6 +280,11 @@ def numeric(function: Callable[[Array], Array], n: int, h: float = 1e-6) -> Arra
     return np.stack([(function(s) - function(-s)) / (2 * h) for s in h * np.eye(n)], axis=1)
 
 
+def at(pose: gtsam.Pose3, linear: Array, velocity: Array | None = None) -> KeyState:
+    bias = gtsam.imuBias.ConstantBias()
+    return KeyState(pose, np.zeros(3) if velocity is None else velocity, bias, linear)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -287,11 +292,15 @@ def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
     b = a.compose(gtsam.Pose3.Expmap(rng.normal(0, 0.4, 6)))
     wheels = WheelIncrement(rng.normal(0, 0.2, 3), np.ones(4), 0.3, 0.2, -0.1, 0.4, 0.05)
     linear = rng.uniform(-0.2, 0.4, N)
-    H_a, H_b, H_linear = jacobians(a, b, linear, wheels)
+
+    def residual(a: gtsam.Pose3, b: gtsam.Pose3, linear: Array) -> Array:
+        return wheel_factor.linearised(at(a, linear), at(b, linear), wheels)[0]
+
+    _, H_a, H_b, H_linear = wheel_factor.linearised(at(a, linear), at(b, linear), wheels)
     for H, function, n in (
-        (H_a, lambda s: residual(a.retract(s), b, linear, wheels), 6),
-        (H_b, lambda s: residual(a, b.retract(s), linear, wheels), 6),
-        (H_linear, lambda s: residual(a, b, linear + s, wheels), N),
+        (H_a, lambda s: residual(a.retract(s), b, linear), 6),
+        (H_b, lambda s: residual(a, b.retract(s), linear), 6),
+        (H_linear, lambda s: residual(a, b, linear + s), N),
     ):
         np.testing.assert_allclose(H, numeric(function, n), atol=1e-6)
 
@@ -302,13 +311,16 @@ def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
     pose, linear = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N)
     place, lever, speed = rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), rng.normal(0, 1, 3)
     fix = GnssPosition(place, lever, np.ones(3), 0.3, speed, delay_s=0.4)
-    H_pose, H_linear = gnss_factor.jacobians(fix, pose, linear)
-    np.testing.assert_allclose(
-        H_pose, numeric(lambda s: gnss_factor.residual(fix, pose.retract(s), linear), 6), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        H_linear, numeric(lambda s: gnss_factor.residual(fix, pose, linear + s), N), atol=1e-6
-    )
+
+    def residual(pose: gtsam.Pose3, linear: Array) -> Array:
+        return gnss_factor.linearised(fix, at(pose, linear))[0]
+
+    _, H_pose, H_linear = gnss_factor.linearised(fix, at(pose, linear))
+    for H, function, n in (
+        (H_pose, lambda s: residual(pose.retract(s), linear), 6),
+        (H_linear, lambda s: residual(pose, linear + s), N),
+    ):
+        np.testing.assert_allclose(H, numeric(function, n), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -321,11 +333,15 @@ def test_velocity_jacobians_match_finite_differences(seed: int) -> None:
         rng.normal(0, 0.5, 3),
         lever_arm_velocity(rng.normal(0, 1, 3), -0.1),
     )
-    H_pose, H_velocity, H_linear = velocity_factor.jacobians(told, pose, linear)
+
+    def residual(pose: gtsam.Pose3, v: Array, linear: Array) -> Array:
+        return velocity_factor.linearised(told, at(pose, linear, v))[0]
+
+    _, H_pose, H_linear = velocity_factor.linearised(told, at(pose, linear, v))
     for H, function, n in (
-        (H_pose, lambda s: velocity_factor.residual(told, pose.retract(s), v, linear), 6),
-        (H_velocity, lambda s: velocity_factor.residual(told, pose, v + s, linear), 3),
-        (H_linear, lambda s: velocity_factor.residual(told, pose, v, linear + s), N),
+        (H_pose, lambda s: residual(pose.retract(s), v, linear), 6),
+        (np.eye(3), lambda s: residual(pose, v + s, linear), 3),
+        (H_linear, lambda s: residual(pose, v, linear + s), N),
     ):
         np.testing.assert_allclose(H, numeric(function, n), atol=1e-6)
 

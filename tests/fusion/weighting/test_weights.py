@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import gtsam
 import numpy as np
 import pytest
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
 from terrafusion.fusion.weighting.innovation import InnovationWeighting, SageHusa, Variational
@@ -246,9 +248,7 @@ class Window:
     """Stands for a chain whose fixes do not move its states."""
 
     def __init__(self, errors: list[float], weights: list[float]) -> None:
-        import gtsam
-
-        self.first, self.state_at_origin = 10, gtsam.Pose3()
+        self.first = 10
         fixes = [
             reweighted(GnssPosition(np.array([e, 0.0, 0.0]), np.zeros(3), np.array([0.5, 0.5, 9.0])), w)
             for e, w in zip(errors, weights, strict=True)
@@ -259,9 +259,9 @@ class Window:
     def smooth(self, count: int, iterations: int) -> None:
         assert count == len(self.nodes)
 
-    def state(self, k: int) -> object:
+    def state(self, k: int) -> KeyState:
         assert 0 <= k - self.first < len(self.nodes)
-        return dataclasses.make_dataclass("State", ["pose", "linear"])(self.state_at_origin, np.zeros(15))
+        return KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(15))
 
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         node = self.nodes[k - self.first]
