@@ -133,7 +133,7 @@ class BarometerAiding(BiasedSensor[float]):
             return False
         lever = np.array(self.spec.position_m)
         factor = height_factor(chain.last, height_m + relative.innovation, relative.sigma, lever)
-        chain.add(chain.last, factor, "X")
+        chain.add(chain.last, factor)
         return True
 
     def _has_jumped(self) -> None:

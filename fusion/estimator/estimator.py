@@ -343,7 +343,7 @@ class Estimator:
             stream.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
-            self.chain.add(k, level_factor(k), "X")
+            self.chain.add(k, level_factor(k))
         aided = not self.gnss.is_outage(t_ns)
         self._stationarity.update(self.chain, link, self.imu, self.wheels, before, aided)
         rolled_m = rolled.distance_m if rolled else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import operator
 from collections import deque
 
 import gtsam
@@ -43,6 +42,7 @@ from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
 from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.kept import Kept
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.slow_states import SLIP_STEADY
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream
@@ -116,8 +116,7 @@ class LearnedNumbers:
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known, self._skids = prior, config.rig.drive in SKIDDING
-        self._place: tuple[Knowledge, PlaceBelief] | None = None
-        self._moments: tuple[Knowledge, Array, float, Array] | None = None  # and of what they were made
+        self._place, self._moments = Kept[PlaceBelief](), Kept[Array]()
         self._before_skid: Knowledge | None = None
         self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
@@ -216,11 +215,12 @@ class LearnedNumbers:
         Of the lag, those on the grounds that were driven; its spread between grounds is in the graph.
         """
         gnss = self._gnss
-        made_of = self._known, gnss.antenna_m, gnss.delay_s
-        if self._moments is None or any(map(operator.is_not, self._moments[:3], made_of)):
+
+        def moments() -> Array:
             x_m, y_m, _ = (gnss.antenna_m - gnss.nominal_antenna_m).tolist()
-            self._moments = *made_of, self._moments_about(np.array([x_m, y_m, gnss.delay_s]))
-        return self._moments[3]
+            return self._moments_about(np.array([x_m, y_m, gnss.delay_s]))
+
+        return self._moments.of((self._known, gnss.antenna_m, gnss.delay_s), moments)
 
     def past_place_moments(self, t_ns: TimesNs) -> Array:
         """The same (N, 4) of those that were in use at the times (N,), by what is known now."""
@@ -231,12 +231,11 @@ class LearnedNumbers:
         """Moments (..., 4) about corrections (..., 3) of antenna and delay."""
         if self.calibration is None:
             return np.zeros((*used.shape[:-1], 4))
-        if self._place is None or self._place[0] is not self._known:
-            corrected = self._clear[[CORRECTED.index(number) for number in PLACE]]
-            self._place = self._known, PlaceBelief.of(self._known, self._before, corrected)
+        corrected = self._clear[[CORRECTED.index(number) for number in PLACE]]
+        place = self._place.of((self._known,), lambda: PlaceBelief.of(self._known, self._before, corrected))
         lag_s, lag_sigma_s = self._known.mean[COURSE_LAG], self._known.sigma[COURSE_LAG]
         lag_s2 = (lag_s - self.course_lag_s()[0]) ** 2 + lag_sigma_s**2
-        return np.concatenate([self._place[1].moments(used), np.full((*used.shape[:-1], 1), lag_s2)], axis=-1)
+        return np.concatenate([place.moments(used), np.full((*used.shape[:-1], 1), lag_s2)], axis=-1)
 
     def corrections(self) -> Corrections:
         """What the drive refuted of the robot's numbers."""

@@ -241,7 +241,7 @@ class MagnetometerAiding(BiasedSensor[Array]):
         own = self._gated(self.bias, t_ns, innovation, H, variance, noise)
         if own is None:
             return False
-        chain.add(chain.last, heading_factor(chain.last, R, own.innovation, own.sigma), "X")
+        chain.add(chain.last, heading_factor(chain.last, R, own.innovation, own.sigma))
         return True
 
     def _heading_of_field(self, R: Array, field: Array) -> tuple[float, Array]:

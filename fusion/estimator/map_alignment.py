@@ -126,12 +126,9 @@ def drop_local_factors(nodes: list[Node]) -> None:
         factors = [node.unary.at(i) for i in range(node.unary.size())]
         stays = [factor for factor in factors if not _is_local(factor)]
         if len(stays) < len(factors):
-            node.forget_rows()
             node.unary = gtsam.NonlinearFactorGraph()
             for factor in stays:
                 node.unary.add(factor)
-            symbols = [gtsam.Symbol(key) for factor in stays for key in list(factor.keys())]
-            node.unary_keys = {chr(symbol.chr()).upper() for symbol in symbols}
 
 
 def _is_local(factor: gtsam.NonlinearFactor) -> bool:

@@ -169,7 +169,7 @@ def _add_zero_velocity(chain: Chain, link: gtsam.NonlinearFactorGraph) -> None:
     """Zero velocity at the newest keyframe, and in its `link` no motion since the one before."""
     k = chain.last
     link.add(no_motion_factor(k))
-    chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED), "V")
+    chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED))
 
 
 def noise_at_rest(spec: ImuSpec, rate_hz: float, gyro: Array, accel: Array) -> tuple[float, float]:

@@ -103,13 +103,11 @@ class Chain:
             self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
         return self.last
 
-    def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
-        """Add a factor that touches only the states `keys` (of "XVB") of keyframe k."""
-        node = self._changed(k)
-        node.unary.add(factor)
-        node.unary_keys.update(keys)
+    def add(self, k: int, factor: gtsam.NonlinearFactor) -> None:
+        """Add a factor of GTSAM that touches keyframe k alone."""
+        self._changed(k).unary.add(factor)
         if self.archive is not None:
-            self.archive.add(k, factor, keys)
+            self.archive.add(k, factor)
 
     def add_fix(self, k: int, fix: GnssPosition) -> None:
         """Add a GNSS position to keyframe k."""
@@ -133,9 +131,7 @@ class Chain:
     def _changed(self, k: int) -> Node:
         """Keyframe k, of which a factor of its own is about to change."""
         self._dirty = min(self._dirty, k)
-        node = self.nodes[k - self.first]
-        node.forget_rows()
-        return node
+        return self.nodes[k - self.first]
 
     def at_or_after(self, t_ns: int) -> int | None:
         """The first keyframe held at or after a time; None when there is none, or when older ones were
@@ -222,7 +218,7 @@ class Chain:
     def _erase(self, begin: int, end: int) -> None:
         """Erase the variables of GTSAM of the keyframes `begin` to `end - 1`."""
         for k in range(begin, min(end, self._inserted)):
-            for symbol, _ in SYMBOLS.values():
+            for symbol, _ in SYMBOLS:
                 self.values.erase(symbol(k))
 
     def restart(

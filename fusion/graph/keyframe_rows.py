@@ -13,7 +13,7 @@ from terrafusion.fusion.graph.key_state import BIAS, DIM, IMU_ROTATION, NAV, POS
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.wheel_factor import linearised
 
-SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
+SYMBOLS = ((X, POSE), (V, VELOCITY), (B, BIAS))
 WHEEL_ROWS = 4
 _PLACES = np.arange(DIM - NAV.stop)
 _IN_TIME_ORDER = np.r_[0:9, 18:24, 9:18, 24:31]
@@ -43,39 +43,38 @@ def own_rows(node: Node, k: int, values: gtsam.Values, further: int = 0, width: 
 
 def measured_rows(node: Node, k: int, values: gtsam.Values) -> list[Array]:
     """Rows (m, dim + 1) of the factors that touch keyframe k alone."""
-    held = node.held_rows()
-    if held is not None:
-        return held
+    made_of = node.point, node.unary, node.unary.size(), *node.fixes, *node.velocities
+    return node.own_rows.of(made_of, lambda: _measured_rows(node, k, values))
+
+
+def _measured_rows(node: Node, k: int, values: gtsam.Values) -> list[Array]:
     dim = len(node.delta)
-    blocks = [_gtsam_rows(node, k, values)] if node.unary_keys else []
+    blocks = [_gtsam_rows(node, k, values)] if node.unary.size() else []
     blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
     blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
-    return node.hold_rows(blocks)
+    return blocks
 
 
 def _gtsam_rows(node: Node, k: int, values: gtsam.Values) -> Array:
-    dim, present = len(node.delta), [name for name in "XVB" if name in node.unary_keys]
+    dim, keys = len(node.delta), set(node.unary.keyVector())
+    touched = [(symbol(k), place) for symbol, place in SYMBOLS if symbol(k) in keys]
     ordering = gtsam.Ordering()
-    for name in present:
-        ordering.push_back(SYMBOLS[name][0](k))
+    for key, _ in touched:
+        ordering.push_back(key)
     packed = node.unary.linearize(values).augmentedJacobian(ordering)
     rows = np.zeros((len(packed), dim + 1))
-    column = 0
-    for name in present:
-        place = SYMBOLS[name][1]
-        width = place.stop - place.start
-        rows[:, place] = packed[:, column : column + width]
-        column += width
-    rows[:, dim] = packed[:, -1]
+    columns = np.concatenate([np.arange(dim)[place] for _, place in touched])
+    rows[:, [*columns, dim]] = packed
     return rows
 
 
 def link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
     """Rows (m, 2 dim + 1) of all that links keyframe k - 1, `before`, and keyframe k."""
     made_of = before.point, node.point, node.link, node.link.size(), node.markov, node.wheels
-    held = node.held_link(made_of)
-    if held is not None:
-        return held
+    return node.link_rows.of(made_of, lambda: _link_rows(before, node, k, values))
+
+
+def _link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
     dim, packed = len(node.delta), linearised_link(node, k, values)
     n, linear = len(packed), dim - NAV.stop
     rows = np.zeros((n + linear + WHEEL_ROWS, 2 * dim + 1), order="F")
@@ -93,7 +92,7 @@ def link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
         wheel[:, 0:6], wheel[:, dim : dim + 6] = H_i / sigma, H_j / sigma
         wheel[:, dim + 15 : 2 * dim] = H_linear[:, :linear] / sigma
         wheel[:, 2 * dim] = -left / node.wheels.sigma
-    return node.hold_link(made_of, rows)
+    return rows
 
 
 def linearised_link(node: Node, k: int, values: gtsam.Values) -> Array:

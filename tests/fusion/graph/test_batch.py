@@ -37,7 +37,7 @@ def varied(calibrate: bool, n: int = 12, seed: int = 0) -> Chain:
         if k == 5:
             links[k - 1].add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), iso(6, 0.1)))
         if k == 6:
-            chain.add(k, gtsam.PriorFactorVector(V(k), np.zeros(3), iso(3, 0.5)), "V")
+            chain.add(k, gtsam.PriorFactorVector(V(k), np.zeros(3), iso(3, 0.5)))
         for i in range(k % 3):
             lever, velocity = np.array([0.2, 0.1 * i, 0.3]), np.array([0.9, 0.3, 0.0])
             fix = GnssPosition(fixes[k], lever, np.array([0.3, 0.4, 1.0]), 0.7, velocity, delay_s=0.02)
