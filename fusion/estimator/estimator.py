@@ -48,7 +48,7 @@ from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import imu_gap, slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import imu_factor, mean_rates, pause, wheel_increment
+from terrafusion.fusion.graph.factors import imu_factor, mean_rates, wheel_increment
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import (
     level_factor,
@@ -326,7 +326,7 @@ class Estimator:
         k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:
-            point, link, wheels = *pause(k, before, dt), None
+            point, link, wheels = *imu_gap.pause(k, before, dt), None
         elif gap:
             point, link, wheels = imu_gap.bridge(k, before, wheels, turn, dt)
         else:

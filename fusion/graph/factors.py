@@ -1,6 +1,5 @@
 """Factors of the localisation graph, each made from one measurement."""
 
-import functools
 import math
 
 import gtsam
@@ -23,8 +22,6 @@ YAW_SIGMA_RADPS, YAW_SIGMA_SHARE = 1.0, 0.3
 a robot by 0.03 rad/s for a minute (assumed), like white noise of 0.03 sqrt(2 60 / 0.1)."""
 FLOOR_M = 2e-3
 """Least sigma of a wheel displacement across the rolling direction, m per keyframe."""
-PAUSE_MPS, PAUSE_YAW_RAD = 1.0, 1.0
-"""Speed of a robot while no sample comes, at least, and how far it turns: 1 sigma each (assumed)."""
 SURGE_SPEED_MPS = 0.3
 """Wheels that accelerate slip as if they were so much faster (assumed; in the twin straight on 0.07 m/s on
 asphalt, 0.44 on loose sand)."""
@@ -82,19 +79,6 @@ def no_motion_factor(k: int) -> gtsam.NonlinearFactor:
     )
 
 
-def pause(k: int, before: KeyState, dt_s: float) -> tuple[KeyState, gtsam.NonlinearFactorGraph]:
-    """State and link after a time without samples: the old place, uncertain by what it may have driven."""
-    speed = max(float(np.linalg.norm(before.velocity)), PAUSE_MPS)
-    sigmas = np.array([0.1, 0.1, PAUSE_YAW_RAD, *[speed * dt_s] * 2, 0.1 * speed * dt_s])
-    graph = gtsam.NonlinearFactorGraph()
-    moved = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), moved))
-    graph.add(gtsam.BetweenFactorVector(V(k - 1), V(k), -before.velocity, isotropic(3, round(speed, 3))))
-    same = gtsam.imuBias.ConstantBias()
-    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, isotropic(6, 1e-3)))
-    return KeyState(before.pose, np.zeros(3), before.bias, before.linear), graph
-
-
 def antenna_lever(
     state: KeyState, dt_s: float, gyro_radps: Array, accel_world_mps2: Array, antenna_m: Array
 ) -> Array:
@@ -120,8 +104,3 @@ def mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
 def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
     """The preintegrated IMU between keyframes k - 1 and k."""
     return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured)
-
-
-@functools.lru_cache(maxsize=4096)
-def isotropic(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
-    return gtsam.noiseModel.Isotropic.Sigma(dim, sigma)
