@@ -24,7 +24,7 @@ from scipy.special import gammaincinv
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import DRIFT, NAV
+from terrafusion.fusion.graph.key_state import DRIFT
 from terrafusion.fusion.noise.policy import SensorNoise
 
 WINDOW_S = 5.0
@@ -100,7 +100,7 @@ class DriftWatch:
         by what the fixes report."""
         if not self.fresh:
             return
-        drift_m = np.array(chain.state(chain.last).linear[DRIFT.start - NAV.stop : DRIFT.stop - NAV.stop])
+        drift_m = chain.state(chain.last).of(DRIFT)
         P = chain.covariance_at(chain.last)
         t_ns, variance_m2 = chain.nodes[-1].t_ns, 0.5 * float(np.trace(P[DRIFT, DRIFT]))
         self.learn(t_ns, drift_m, variance_m2, least_m)

@@ -66,7 +66,7 @@ from terrafusion.fusion.inputs.streams import (
     is_gap,
     usual_interval_s,
 )
-from terrafusion.fusion.inputs.time_jumps import EarlyFixes
+from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
 from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
@@ -86,7 +86,7 @@ UNKNOWN = np.full(3, np.nan)
 class Estimator:
     """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
 
-    Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the IMU
+    Samples may come late and out of order (see `ordered_samples`); keyframes are made as soon as the IMU
     and the wheels (or their waiting time) cover them. `on_state` is called with every new `State`,
     `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
     """
@@ -107,11 +107,11 @@ class Estimator:
         """Back to before the first sample; configuration and callbacks stay."""
         config, rig = self.config, self.config.rig
         self.chain = Chain(archive, config.calibrate)
-        self.imu = ImuStream(six_axis=not config.inputs.planar)
-        self.newest = self.imu.late.jump.newest
-        self.wheels, self.fixes = WheelStream(self.newest), EarlyFixes(self.newest)
+        self.newest = newest = Newest()
+        self.imu, self.wheels = ImuStream(not config.inputs.planar, newest), WheelStream(newest)
+        self.steering, self.fixes = SteeringStream(rig, newest), EarlyFixes(newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
-        self.steering, self._turn = SteeringStream(rig, self.newest), steered_turn(rig, config.inputs)
+        self._turn = steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu, rig.drive in SKIDDING)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
@@ -321,7 +321,7 @@ class Estimator:
         if self.config.inputs.planar and wheels is not None:
             segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt)
         if self._skid.friction is not None:
-            link_inputs = t_ns, dt, segments, wheels, before, self._covariance, self._skid.rate_m2ps
+            link_inputs = t_ns, dt, segments, wheels, before, self.chain.covariance, self._skid.rate_m2ps
             segments, wheels = self._skid.friction.step(*link_inputs)
         k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
@@ -352,27 +352,22 @@ class Estimator:
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> State:
         chain = self.chain
         chain.solve(SMOOTH_WINDOW)
-        before = chain.covariance()
+        before = chain.covariance
         if chain.archive is None:  # a batch needs no odometry frame
             self._frame.step(chain)
         if self.gnss.update(chain, self.weights.noise):
             chain.solve(SMOOTH_WINDOW)
-        if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
+        if self.aids.update(chain, self.imu.t_ns[-1], before, self.chain.covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
         chain.forget(self._keep)
-        self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
+        self.monitor.watch(t_ns, chain.state(chain.last), self.chain.covariance[VELOCITY, VELOCITY], rolled_m)
         return self._emitted(t_ns, gyro)
 
     @property
-    def _covariance(self) -> Array:
-        """Marginal covariance (dim, dim) of the newest keyframe."""
-        return self.chain.covariance()
-
-    @property
     def _reported_covariance(self) -> Array:
-        """The same with what is not known of antenna and delay of the fixes."""
+        """Covariance (dim, dim) of the newest keyframe, with the doubt of antenna and delay of the fixes."""
         R = self.chain.state(self.chain.last).rotation
-        return self._place_doubt.widened(self._covariance, R, self.learned.place_moments())
+        return self._place_doubt.widened(self.chain.covariance, R, self.learned.place_moments())
 
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
@@ -405,7 +400,7 @@ class Estimator:
         increment = self._jitter.applied(wheel_increment(*path, noise, change, calibrates, lag_s))
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
-            return self._turn.between(before_ns, t_ns, increment, self.steering, self._covariance)
+            return self._turn.between(before_ns, t_ns, increment, self.steering, self.chain.covariance)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
@@ -416,7 +411,7 @@ class Estimator:
         gate, dt = self._wheel_gate, self._step_ns * 1e-9
         wheels = gate.rejoined(wheels, dt)
         innovation, variance = wheel_innovation(
-            wheels, before, point, self._covariance, self.weights.noise, dt, switch
+            wheels, before, point, self.chain.covariance, self.weights.noise, dt, switch
         )
         robot = before.forward_mps, point.forward_mps
         accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)

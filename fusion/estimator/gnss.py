@@ -335,7 +335,7 @@ class GnssUpdater:
         fix, self._unchecked = self._unchecked, None
         if fix is None:
             return False
-        yaw_sigma = float(np.sqrt(chain.covariance()[2, 2]))
+        yaw_sigma = float(np.sqrt(chain.covariance[2, 2]))
         turn = self.track.heading_correction(yaw_sigma, self.scale)
         if turn is None:
             return False

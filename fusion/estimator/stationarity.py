@@ -135,7 +135,7 @@ class StationarityDetector:
 
         `link` leads to it from the keyframe with the state `before`; `aided`: fixes hold the estimate.
         """
-        sigma_mps = math.sqrt(chain.covariance()[VELOCITY, VELOCITY].trace()) if aided else math.inf
+        sigma_mps = math.sqrt(chain.covariance[VELOCITY, VELOCITY].trace()) if aided else math.inf
         biases = before.bias.gyroscope(), before.bias.accelerometer()
         speed_mps, t_ns = math.sqrt(before.velocity @ before.velocity), chain.nodes[-1].t_ns
         if self.is_stationary(t_ns, imu, wheels, *biases, speed_mps, sigma_mps):

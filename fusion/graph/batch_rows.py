@@ -38,6 +38,7 @@ from terrafusion.fusion.graph.key_state import (
     VELOCITY,
     WHEEL_DELAY,
     YAW_SCALE,
+    among_linear,
 )
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
@@ -155,7 +156,7 @@ class RowBlock:
             by_bias[:, :, 3:], measured[:, :, 3:]
         )
         rows[at[:, None, None], place[:, :, None], np.arange(IMU_ROTATION.start, IMU_ROTATION.stop)] = turn
-        d = linear[at][:, IMU_ROTATION.start - NAV.stop : IMU_ROTATION.stop - NAV.stop]
+        d = linear[at][:, among_linear(IMU_ROTATION)]
         rows[at[:, None], place, -1] -= np.einsum("kri,ki->kr", turn, d)
 
 
@@ -290,7 +291,7 @@ class _Fixes:
         """Into rows (n, m, 2 dim + 1)."""
         at, dim = self._at, (rows.shape[2] - 1) // 2
         R, x = R[at], linear[at]
-        drift, antenna = (slice(s.start - NAV.stop, s.stop - NAV.stop) for s in (DRIFT, ANTENNA))
+        drift, antenna = among_linear(DRIFT), among_linear(ANTENNA)
         delay = GNSS_DELAY - NAV.stop
         lever = self._lever.copy()
         lever[:, :2] += x[:, antenna]
@@ -329,7 +330,7 @@ class _Velocities:
         if not len(self._at):
             return
         at, dim = self._at, (rows.shape[2] - 1) // 2
-        R, antenna = R[at], slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
+        R, antenna = R[at], among_linear(ANTENNA)
         lever = self._lever.copy()
         lever[:, :2] += linear[at][:, antenna]
         lever_velocity = np.einsum("kij,kj->ki", self._by_lever, lever)

@@ -146,13 +146,9 @@ class Chain:
         """Best state of keyframe k as of the last `solve` (newest) or `smooth` (all)."""
         return self.nodes[k - self.first].state()
 
-    def covariance(self) -> Array:
-        """Marginal covariance (dim, dim) of the newest keyframe, read-only."""
-        return self._covariance
-
     @functools.cached_property
-    def _covariance(self) -> Array:
-        """Dropped where the root changes."""
+    def covariance(self) -> Array:
+        """Marginal covariance (dim, dim) of the newest keyframe, read-only; dropped with the root."""
         inverse, info = lapack.dtrtri(self._root[:, : self.dim])
         if info:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
@@ -162,7 +158,7 @@ class Chain:
 
     def covariance_at(self, k: int) -> Array:
         """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
-        covariance = self.covariance()
+        covariance = self.covariance
         for node in self.nodes[-2 : k - self.last - 2 : -1]:
             assert node.conditional is not None
             covariance = covariance_before(node.conditional, covariance)
@@ -206,7 +202,7 @@ class Chain:
         self._root = node.prior if alone else triangular(own_rows(node, last, self.values))
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
         self._dirty = last + 1
-        vars(self).pop("_covariance", None)
+        vars(self).pop("covariance", None)
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""

@@ -24,10 +24,11 @@ from terrafusion.fusion.graph.key_state import (
     NAV,
     POSE,
     KeyState,
+    among_linear,
     skew,
 )
 
-_DRIFT, _ANTENNA = (slice(s.start - NAV.stop, s.stop - NAV.stop) for s in (DRIFT, ANTENNA))
+_DRIFT, _ANTENNA = among_linear(DRIFT), among_linear(ANTENNA)
 _DELAY = GNSS_DELAY - NAV.stop
 
 

@@ -63,9 +63,7 @@ class KeyState:
 
     def of(self, place: int | slice) -> Array:
         """Linear states by their place in the tangent, such as `DRIFT`."""
-        if isinstance(place, slice):
-            return self.linear[place.start - NAV.stop : place.stop - NAV.stop]
-        return self.linear[place - NAV.stop]
+        return self.linear[among_linear(place) if isinstance(place, slice) else place - NAV.stop]
 
     @functools.cached_property
     def rotation(self) -> Array:
@@ -91,11 +89,6 @@ class KeyState:
     def turning(self) -> float:
         """Angle turned over that of the wheels."""
         return float(1.0 + self.linear[YAW_SCALE - NAV.stop])
-
-    @property
-    def drift(self) -> Array:
-        """Drift of the GNSS position (2,), m."""
-        return self.of(DRIFT)
 
     def retract(self, delta: Array) -> "KeyState":
         """The state moved by a tangent vector (DIM,) or (DIM - len(ON_DEMAND),)."""
@@ -149,6 +142,11 @@ class KeyState:
             self.bias.accelerometer() - self._mounting(accel_mps2),
             self.bias.gyroscope() - self._mounting(gyro_radps),
         )
+
+
+def among_linear(place: slice) -> slice:
+    """A place of the tangent, such as `DRIFT`, among the linear states."""
+    return slice(place.start - NAV.stop, place.stop - NAV.stop)
 
 
 def linear_sigma(P: Array) -> Array:

@@ -14,10 +14,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.graph.key_state import ANTENNA, MARKOV, NAV, POSE, VELOCITY, KeyState, skew
+from terrafusion.fusion.graph.key_state import (
+    ANTENNA,
+    MARKOV,
+    NAV,
+    POSE,
+    VELOCITY,
+    KeyState,
+    among_linear,
+    skew,
+)
 
 _AXES = np.arange(3)
-_ANTENNA = slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
+_ANTENNA = among_linear(ANTENNA)
 
 
 @dataclass(frozen=True, eq=False)

@@ -234,14 +234,14 @@ def stand(aid: BarometerAiding, heights: list[float], placed_from: int | None = 
     chain.append(0, point)
     chain.set_prior(np.full(chain.dim, 0.2))
     chain.solve(1)
-    P = chain.covariance()
+    P = chain.covariance
     for i, height in enumerate(heights, 1):
         chain.nodes[-1].t_ns = i * 1_100_000_000
         aid.add(chain.nodes[-1].t_ns, float(pressure_at(height)))
         placed = placed_from is not None and i >= placed_from
         if aid.update(chain, chain.nodes[-1].t_ns, chain.nodes[-1].t_ns, P, P, placed):
             chain.solve(1)
-            P = chain.covariance()
+            P = chain.covariance
 
 
 def test_a_pressure_that_jumps_is_refused_then_taken_for_a_new_reference() -> None:

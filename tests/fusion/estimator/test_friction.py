@@ -328,11 +328,11 @@ def test_a_refuted_slide_loosens_its_links_and_has_them_back(ice: Recording) -> 
     _, _, estimator = followed(ice, until_s=34.0)
     chain, skid = estimator.chain, estimator.gnss.skid
     nodes = chain.nodes[-8:]
-    links, sure = [node.link for node in nodes], chain.covariance()
+    links, sure = [node.link for node in nodes], chain.covariance
     since, ahead = nodes[0].t_ns, [np.array([0.5, 0.0]), np.array([0.6, 0.0])]
     assert skid.test_wheels(chain, chain.last, since, ahead, 0.1, estimator.weights.noise)
     assert all(node.link is not link for node, link in zip(nodes[1:], links[1:], strict=True))
-    assert (np.diag(chain.covariance())[3:8] > 1.2 * np.diag(sure)[3:8]).any()
+    assert (np.diag(chain.covariance)[3:8] > 1.2 * np.diag(sure)[3:8]).any()
     skid.undo(chain)
     assert all(node.link is link for node, link in zip(nodes, links, strict=True))
 

@@ -147,9 +147,9 @@ def driving() -> Estimator:
 
 
 def test_fixes_may_move_the_place_by_what_a_new_delay_and_antenna_shift_them(driving: Estimator) -> None:
-    before = driving.chain.covariance()[3:5, 3:5]
+    before = driving.chain.covariance[3:5, 3:5]
     _doubt_place(driving.chain, 0.5)
-    assert driving.chain.covariance()[3:5, 3:5] - before == pytest.approx(0.25 * np.eye(2), abs=1e-6)
+    assert driving.chain.covariance[3:5, 3:5] - before == pytest.approx(0.25 * np.eye(2), abs=1e-6)
 
 
 def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estimator) -> None:

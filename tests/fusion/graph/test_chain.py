@@ -174,7 +174,7 @@ def test_filter_ends_where_the_batch_ends() -> None:
     # Live keyframes are linearised again only beyond 0.02 rad: a tenth of a sigma is left.
     sigma = np.sqrt(np.diag(whole.covariances()[-1]))
     assert (np.abs(a.local(b)) < 0.1 * sigma).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(live.covariance())), sigma, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.diag(live.covariance)), sigma, rtol=0.1)
 
 
 def test_a_late_fix_linearises_no_link_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,7 +210,7 @@ def test_a_late_fix_linearises_no_link_again(monkeypatch: pytest.MonkeyPatch) ->
     once, twice = solved(late=False), solved(late=True)
     assert made == [6]
     assert (once.nodes[-1].delta == twice.nodes[-1].delta).all()
-    assert (once.covariance() == twice.covariance()).all()
+    assert (once.covariance == twice.covariance).all()
 
 
 def test_forgetting_keeps_the_information() -> None:
@@ -237,7 +237,7 @@ def test_forgetting_keeps_the_information() -> None:
     assert len(short.nodes) == 8
     assert short.first == 22
     np.testing.assert_allclose(short.nodes[-1].delta, whole.nodes[-1].delta, atol=1e-8)
-    np.testing.assert_allclose(short.covariance(), whole.covariance(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(short.covariance, whole.covariance, rtol=1e-6, atol=1e-12)
     for chain in (short, whole):
         chain._back_substitute_to(24, solved=chain.last)
         chain._back_substitute_to(23, solved=26)
@@ -266,13 +266,13 @@ def test_restart_keeps_state_and_adds_doubt() -> None:
     chain = Chain(calibrate=True)
     build(chain, 20)
     chain.solve(20)
-    before, P = chain.state(19), chain.covariance()
+    before, P = chain.state(19), chain.covariance
     doubt = np.zeros(DIM)
     doubt[3:6] = 25.0
     chain.restart(doubt)
     assert chain.first == chain.last == 19
     assert np.abs(chain.state(19).pose.localCoordinates(before.pose)).max() < 1e-9
-    np.testing.assert_allclose(chain.covariance(), P + np.diag(doubt), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(chain.covariance, P + np.diag(doubt), rtol=1e-6, atol=1e-9)
 
 
 def numeric(function: Callable[[Array], Array], n: int, h: float = 1e-6) -> Array:
