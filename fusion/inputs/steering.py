@@ -4,14 +4,15 @@ import bisect
 import math
 
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.inputs.streams import Lateness, Newest
+from terrafusion.fusion.inputs.ordered_samples import OrderedSamples
+from terrafusion.fusion.inputs.time_jumps import Newest
 from terrafusion.fusion.inputs.validation import as_number, checked_time
 
 LONGEST_HOLD_S = 1.0
 """An angle holds for so long, or for three intervals of slower samples."""
 
 
-class SteeringStream:
+class SteeringStream(OrderedSamples):
     """Steering angles over time, as the curvature (tan front - tan rear) / wheelbase of the bicycle model.
 
     The point that follows the wheels (`Rig.ahead_m`) moves (tan front + tan rear) / 2 to the left per metre
@@ -19,10 +20,10 @@ class SteeringStream:
     Angles that no wheel has are left out; `impossible` counts them.
     """
 
+    COLUMNS = ("t_ns", "per_m", "course")
+
     def __init__(self, rig: Rig, newest: Newest | None = None) -> None:
-        self.late = Lateness("steering", newest)
-        self.impossible = 0
-        self.t_ns: list[int] = []
+        super().__init__("steering", newest)
         self.per_m: list[float] = []
         self.course: list[float] = []
         self._wheelbase_m, self._by_rear = rig.wheelbase_m, rig.ahead_m > 0.0
@@ -43,10 +44,7 @@ class SteeringStream:
         front, rear = math.tan(front_rad), math.tan(rear_rad)
         sample = t_ns, (front - rear) / self._wheelbase_m, rear if self._by_rear else 0.5 * (front + rear)
         for at_ns, per_m, course in self.late.jump.admitted(sample):
-            for _ in range(self.late.from_future(at_ns, self.t_ns)):
-                for values in (self.t_ns, self.per_m, self.course):
-                    values.pop()
-            i = self.late.place(at_ns, self.t_ns)
+            i = self.place(at_ns)
             if i is not None:
                 self.t_ns.insert(i, at_ns)
                 self.per_m.insert(i, per_m)
@@ -80,9 +78,3 @@ class SteeringStream:
             return None
         share = (t_ns - before_ns) / (self.t_ns[i] - before_ns)
         return values[i - 1] + share * (values[i] - values[i - 1])
-
-    def forget(self, before_ns: int) -> None:
-        """Drop angles older than `before_ns`, in blocks so that it stays cheap."""
-        i = bisect.bisect_left(self.t_ns, before_ns)
-        if i > 256:
-            del self.t_ns[:i], self.per_m[:i], self.course[:i]

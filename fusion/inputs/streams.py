@@ -12,7 +12,8 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
-from terrafusion.fusion.inputs.time_jumps import CONFIRMED, JUMP_NS, Newest, TimeJump
+from terrafusion.fusion.inputs.ordered_samples import OrderedSamples
+from terrafusion.fusion.inputs.time_jumps import Newest, median_step_ns
 from terrafusion.fusion.inputs.validation import (
     MOST_MPS,
     MOST_MPS2,
@@ -49,9 +50,6 @@ SPIKE_WINDOW_NS = 500_000_000
 """Where half the samples of this time are spikes, they are believed."""
 REPLACED_BY = 10
 """Number of samples before a spike whose mean replaces it: fewer would contain too much vibration."""
-MOST_LATE_S = 5.0
-"""A sample this much older than its stream's newest is no late message: the clock has jumped."""
-LONGEST_WAIT_S = 0.5
 LONGEST_PAUSE_NS = 20_000_000_000
 """A longer pause of the IMU has no keyframes: what a call computes is bounded."""
 USUAL_GAP_S = 0.5
@@ -66,9 +64,7 @@ JUMP_M = 5.0
 
 def usual_interval_s(times: list[int]) -> float:
     """Median interval of the newest samples of a stream, s; 0 with fewer than three."""
-    newest = times[-INTERVALS_SEEN:]
-    intervals = sorted(b - a for a, b in itertools.pairwise(newest))
-    return intervals[len(intervals) // 2] * 1e-9 if len(intervals) > 1 else 0.0
+    return median_step_ns(times[-INTERVALS_SEEN:]) * 1e-9
 
 
 def longest_gap_s(times: list[int]) -> float:
@@ -81,62 +77,7 @@ def is_gap(seconds: float, times: list[int]) -> bool:
     return seconds > USUAL_GAP_S and seconds > longest_gap_s(times)
 
 
-class Lateness:
-    """Disorder of a stream in time, and samples that came too late.
-
-    A keyframe waits for as long as the stream has been late (an ordered stream costs no waiting). A sample
-    before it is then too late.
-
-    Attributes:
-        wait_ns: longest lateness so far, of those up to `LONGEST_WAIT_S`.
-        used_ns: end of what the keyframes have used.
-        too_late: number of samples left out because their keyframe had been made.
-        jump: samples that come far ahead.
-    """
-
-    def __init__(self, channel: str, newest: Newest | None = None) -> None:
-        self.channel = channel
-        self.jump = TimeJump(newest or Newest(), channel)
-        self.wait_ns = 0
-        self.used_ns: int | None = None
-        self.too_late = 0
-
-    def from_future(self, t_ns: int, times: list[int]) -> int:
-        """How many of the newest samples, fewer than show a jump, have times that were wrong; before the
-        start only."""
-        if self.used_ns is not None:
-            return 0
-        ahead = len(times) - bisect.bisect_right(times, t_ns + JUMP_NS)
-        if not 0 < ahead < CONFIRMED:
-            return 0
-        self.jump.dropped += ahead
-        self.jump.newest.t_ns = t_ns
-        return ahead
-
-    def place(self, t_ns: int, times: list[int]) -> int | None:
-        """Index in `times` where a sample belongs, or None when it is too late.
-
-        Raises:
-            DataError: the sample is so old that the clock must have jumped.
-        """
-        if not times or t_ns >= times[-1]:
-            return len(times)
-        late_ns = times[-1] - t_ns
-        if late_ns > MOST_LATE_S * 1e9:
-            raise DataError(
-                f"sample at {t_ns} ns comes {late_ns * 1e-9:.3f} s after a newer one",
-                channel=self.channel,
-                remedy=f"more than {MOST_LATE_S:g} s is no late message: start anew where a clock jumps",
-            )
-        if late_ns <= LONGEST_WAIT_S * 1e9:  # no waiting would have helped a later one
-            self.wait_ns = max(self.wait_ns, late_ns)
-        if self.used_ns is not None and t_ns <= self.used_ns:
-            self.too_late += 1
-            return None
-        return bisect.bisect_right(times, t_ns)
-
-
-class ImuStream:
+class ImuStream(OrderedSamples):
     """IMU samples; the sample at t stands for the time since the one before it.
 
     Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
@@ -150,16 +91,17 @@ class ImuStream:
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
     """
 
+    COLUMNS = ("t_ns", "gyro", "accel")
+
     def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
+        super().__init__("imu", newest)
         self.six_axis = six_axis
         self.turn_scale = self.mounting_rad = 0.0
         self.level: Array | None = None
-        self.spikes = self.impossible = 0
+        self.spikes = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
         self._accel_held_ns: list[int] = []
-        self.late = Lateness("imu", newest)
-        self.t_ns: list[int] = []
         self.gyro: list[Array] = []
         self.accel: list[Array] = []
 
@@ -189,10 +131,7 @@ class ImuStream:
             self._insert(*sample)
 
     def _insert(self, t_ns: int, gyro: Array, accel: Array, spike: tuple[bool, bool]) -> None:
-        for _ in range(self.late.from_future(t_ns, self.t_ns)):
-            for values in (self.t_ns, self.gyro, self.accel):
-                values.pop()
-        i = self.late.place(t_ns, self.t_ns)
+        i = self.place(t_ns)
         if i is not None:
             if any(spike):
                 if self._is_spike(i, t_ns):
@@ -213,9 +152,6 @@ class ImuStream:
         """Whether most samples before an extreme one at index i are not extreme."""
         since = bisect.bisect_left(self.t_ns, t_ns - SPIKE_WINDOW_NS, hi=i)
         return 2 * sum(t_ns - SPIKE_WINDOW_NS <= t < t_ns for t in self._spike_ns) < i - since
-
-    def covers(self, t_ns: int) -> bool:
-        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
 
     def next_ns(self, now_ns: int, step_ns: int) -> int:
         """Time of the keyframe after one at `now_ns`: a step on, or at the end of a pause in the samples."""
@@ -278,12 +214,10 @@ class ImuStream:
         return t, *self._corrected(gyro, accel)
 
     def forget(self, before_ns: int) -> None:
-        """Drop samples older than `before_ns`, in blocks so that it stays cheap."""
-        i = bisect.bisect_left(self.t_ns, before_ns)
-        if i > 256:
-            del self.t_ns[:i], self.gyro[:i], self.accel[:i]
+        super().forget(before_ns)
+        if self._spike_ns and self.t_ns:
             for times in (self._spike_ns, self._gyro_held_ns, self._accel_held_ns):
-                times[:] = [t for t in times if t >= before_ns]
+                times[:] = [t for t in times if t >= self.t_ns[0]]
 
 
 def turned(vectors: Array, angle_rad: float) -> Array:
@@ -292,18 +226,20 @@ def turned(vectors: Array, angle_rad: float) -> Array:
     return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
-class WheelStream:
+class WheelStream(OrderedSamples):
     """Travelled distance of the left and right side over time.
 
     Samples with a speed or travel that no robot has are left out; `impossible` counts them. Over a jump of
     the counters (a reset) the speeds give the distance; `jumps` counts these.
     """
 
+    COLUMNS = ("t_ns", "left_m", "right_m", "_speeds", "_counted")
+    BEFORE = 1  # from which to interpolate
+
     def __init__(self, newest: Newest | None = None) -> None:
-        self.late = Lateness("wheels", newest)
-        self.impossible = self.jumps = 0
+        super().__init__("wheels", newest)
+        self.jumps = 0
         self._offset_m = 0.0, 0.0
-        self.t_ns: list[int] = []
         self.left_m: list[float] = []
         self.right_m: list[float] = []
         self.noise = CounterNoise()
@@ -341,10 +277,7 @@ class WheelStream:
     def _insert(
         self, t_ns: int, left_mps: float, right_mps: float, counted: tuple[float, float] | None
     ) -> None:
-        for _ in range(self.late.from_future(t_ns, self.t_ns)):
-            for values in (self.t_ns, self.left_m, self.right_m, self._speeds, self._counted):
-                values.pop()
-        i = self.late.place(t_ns, self.t_ns)
+        i = self.place(t_ns)
         if i is None:
             return
         self.t_ns.insert(i, t_ns)
@@ -395,9 +328,6 @@ class WheelStream:
                 self.left_m[j] = drawn(self.left_m[j], counted[0])
                 self.right_m[j] = drawn(self.right_m[j], counted[1])
 
-    def covers(self, t_ns: int) -> bool:
-        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
-
     def travelled(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Distance of the left and right side between two times, m; None where samples are missing."""
         a, b = self._at(start_ns), self._at(end_ns)
@@ -435,8 +365,3 @@ class WheelStream:
             return 0.0
         change = 0.5e9 * (sum(last) / (d - c) - sum(first) / (b - a))
         return change * (end_ns - start_ns) / (0.5 * (c + d - a - b))
-
-    def forget(self, before_ns: int) -> None:
-        i = bisect.bisect_left(self.t_ns, before_ns) - 1
-        if i > 256:
-            del self.t_ns[:i], self.left_m[:i], self.right_m[:i], self._speeds[:i], self._counted[:i]

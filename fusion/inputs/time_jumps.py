@@ -6,6 +6,7 @@ decide between a pause and a wrong clock.
 
 import itertools
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,12 @@ FIX_STEPS, LONGEST_FIX_WAIT_NS = 2, 5_000_000_000
 (assumed)."""
 LONGEST_REFUTED_NS = 5_000_000_000
 """A clock that has gone ahead of the fixes for so long does not return (assumed)."""
+
+
+def median_step_ns(times: Iterable[int]) -> int:
+    """Median of the steps between times, ns, the upper one of two; 0 with fewer than three times."""
+    steps = sorted(b - a for a, b in itertools.pairwise(times))
+    return steps[len(steps) // 2] if len(steps) > 1 else 0
 
 
 @dataclass
@@ -72,8 +79,7 @@ class Newest:
 
     def fix_wait_ns(self) -> int:
         """Time within which another fix shows whether time has jumped; 0 where it does not."""
-        usual = sorted(b - a for a, b in itertools.pairwise(self.fixes_ns))
-        wait_ns = FIX_STEPS * usual[len(usual) // 2] if len(usual) > 1 else 0
+        wait_ns = FIX_STEPS * median_step_ns(self.fixes_ns)
         return wait_ns if 0 < wait_ns <= LONGEST_FIX_WAIT_NS else 0
 
     def admitted(self, t_ns: Any, channel: str) -> int | None:
