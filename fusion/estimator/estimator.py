@@ -69,6 +69,7 @@ from terrafusion.fusion.inputs.streams import (
 from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
 from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
+from terrafusion.fusion.weighting.weighting import wheel_innovation_test
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
 LONGEST_STEP_S = 1.0
@@ -417,7 +418,8 @@ class Estimator:
         accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
-            return self.weights.per_measurement.wheels(t_ns, wheels, innovation, variance, dt)
+            test = wheel_innovation_test(t_ns, wheels, innovation, variance, dt)
+            return self.weights.per_measurement.wheels(wheels, test)
         self.wheels_rejected += not self._silent
         return wheels.doubted(variance, gate.doubt(nis))
 

@@ -31,7 +31,6 @@ from terrafusion.fusion.weighting.weighting import (
     NoiseInForce,
     Weighting,
     inflated,
-    wheel_innovation_test,
 )
 
 FIXED_POINT_STEPS = 4
@@ -101,18 +100,16 @@ class InnovationWeighting(Weighting):
         self._low, self._high = (fixed.gnss_inflation * x for x in GNSS_SPAN)
         self._recorded = {"wheel_sigma_mps": fixed.wheel_sigma_mps, "gnss_inflation": fixed.gnss_inflation}
 
-    def wheels(
-        self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
-    ) -> WheelIncrement:
+    def wheels(self, wheels: WheelIncrement, test: InnovationTest) -> WheelIncrement:
         """Learn from an increment of a moving robot, and weight it by the result."""
+        dt_s = float(test.unit_m[0])
         if abs(wheels.distance_m) < MOVING_MPS * dt_s:
             return wheels
-        test = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
         own_m2, before = float(test.noise_m2[0]), self._noise.noise.wheel_sigma_mps
         quantum_m2 = own_m2 - (before * dt_s) ** 2
         predicted = test.predicted_m2 + quantum_m2
         self._wheels.update(dataclasses.replace(test, predicted_m2=predicted))
-        self._set(t_ns, "wheels", "wheel_sigma_mps", math.sqrt(self._wheels.value), "m/s")
+        self._set(test.t_ns, "wheels", "wheel_sigma_mps", math.sqrt(self._wheels.value), "m/s")
         return inflated(wheels, math.sqrt((quantum_m2 + self._wheels.value * dt_s**2) / own_m2))
 
     def gnss(self, test: InnovationTest) -> tuple[float, float]:

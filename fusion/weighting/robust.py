@@ -33,7 +33,6 @@ from terrafusion.fusion.weighting.weighting import (
     NoiseInForce,
     Weighting,
     inflated,
-    wheel_innovation_test,
 )
 
 IRLS_STEPS = 10
@@ -55,11 +54,8 @@ class RobustWeighting(Weighting):
         self._noise = noise
         self._wheels_doubted = False
 
-    def wheels(
-        self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
-    ) -> WheelIncrement:
+    def wheels(self, wheels: WheelIncrement, test: InnovationTest) -> WheelIncrement:
         """By the Cauchy loss."""
-        test = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
         w = cauchy_weight(test, self.tuning.wheel_c)
         if (w < DOUBTED) != self._wheels_doubted:
             self._wheels_doubted = not self._wheels_doubted

@@ -57,13 +57,11 @@ class Weighting:
 
     passed_nis = 0.0
 
-    def wheels(
-        self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
-    ) -> WheelIncrement:
-        """The increment with the sigma to use; `variance_m2` is that of the innovation."""
+    def wheels(self, wheels: WheelIncrement, test: InnovationTest) -> WheelIncrement:
+        """The increment with the sigma to use; `test` is a `wheel_innovation_test`."""
         return wheels
 
-    def gnss(self, tested: InnovationTest) -> tuple[float, float]:
+    def gnss(self, test: InnovationTest) -> tuple[float, float]:
         """Factor on the horizontal sigma of a fix, and its weight by a robust loss (0 to 1)."""
         return 1.0, 1.0
 
@@ -74,7 +72,7 @@ class Weighting:
 def wheel_innovation_test(
     t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
 ) -> InnovationTest:
-    """A wheel increment against its prediction, along body x."""
+    """A wheel increment over `dt_s` against its prediction, along body x; the innovation and its variance."""
     own = wheels.sigma[0] ** 2
     predicted = max(variance_m2 - own, 0.0)
     return InnovationTest(

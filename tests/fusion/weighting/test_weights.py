@@ -38,6 +38,13 @@ class Recorder:
         self.changes.append(change)
 
 
+def judged(
+    mode: Weighting, wheels: WheelIncrement, innovation_m: float, variance_m2: float
+) -> WheelIncrement:
+    """The increment of 0.1 s by a mode."""
+    return mode.wheels(wheels, wheel_innovation_test(3, wheels, innovation_m, variance_m2, 0.1))
+
+
 def surprise(nu: list[float], predicted: float, noise: float, **more: float) -> InnovationTest:
     n = len(nu)
     unit = more.pop("unit", 1.0)
@@ -69,7 +76,7 @@ def test_a_wheel_increment_is_compared_with_what_is_left_of_its_innovation() -> 
 
 def test_unweighted_measurements_keep_their_sigma() -> None:
     plain, wheels = Weighting(), increment()
-    assert plain.wheels(0, wheels, 9.0, 1.0, 0.1) is wheels
+    assert judged(plain, wheels, 9.0, 1.0) is wheels
     assert plain.gnss(surprise([9.0, 9.0], 0.0, 1.0)) == (1.0, 1.0)
     assert plain.passed_nis == 0.0
     plain_test = surprise([1.0], 0.0, 1.0)
@@ -84,9 +91,9 @@ def test_a_change_is_recorded_from_a_tenth_on(ratio: float, recorded: int) -> No
     nu2 = counter_m2 + 0.01 * sigma**2 * (1.0 + 100.0 * (ratio**2 - 1.0))
     before, mode_nu = recorder.noise, math.sqrt(max(nu2, 0.0))
     if nu2 < 0.0:  # a decrease beyond one step: the prediction's variance takes the rest
-        mode.wheels(3, increment(), 0.0, 0.02**2 - nu2, 0.1)
+        judged(mode, increment(), 0.0, 0.02**2 - nu2)
     else:
-        mode.wheels(3, increment(), mode_nu, 0.02**2, 0.1)
+        judged(mode, increment(), mode_nu, 0.02**2)
     assert recorder.noise.wheel_sigma_mps == pytest.approx(ratio * before.wheel_sigma_mps)
     assert len(recorder.changes) == recorded
 
@@ -127,7 +134,7 @@ def test_wheels_learn_from_what_neither_prediction_nor_counter_explains() -> Non
     counter_m2 = 0.02**2 - (0.1 * sigma) ** 2
     assert counter_m2 > 0.0
     value = sigma**2 + ((0.05**2 - 0.0009 - counter_m2) / 0.01 - sigma**2) / 100.0
-    found = mode.wheels(3, increment(), 0.05, 0.0013, 0.1)
+    found = judged(mode, increment(), 0.05, 0.0013)
     assert recorder.noise.wheel_sigma_mps == pytest.approx(math.sqrt(value))
     assert found.sigma[0] == pytest.approx(math.sqrt(counter_m2 + 0.01 * value))
     assert found.sigma[1:].tolist() == [0.03, 0.04, 0.05]
@@ -136,9 +143,9 @@ def test_wheels_learn_from_what_neither_prediction_nor_counter_explains() -> Non
 def test_wheels_that_stand_teach_nothing() -> None:
     mode, recorder = weighting("innovation")
     before, standing = recorder.noise, increment(distance_m=-0.0049)
-    assert mode.wheels(3, standing, 0.5, 0.0013, 0.1) is standing
+    assert judged(mode, standing, 0.5, 0.0013) is standing
     assert recorder.noise == before
-    mode.wheels(3, increment(distance_m=-0.0051), 0.5, 0.0013, 0.1)
+    judged(mode, increment(distance_m=-0.0051), 0.5, 0.0013)
     assert recorder.noise != before
 
 
@@ -146,10 +153,10 @@ def test_the_noise_of_wheels_stays_within_its_span_and_its_changes_are_recorded(
     mode, recorder = weighting("innovation", innovation_method="sage_husa")
     tuned = recorder.noise.wheel_sigma_mps
     for _ in range(2000):
-        mode.wheels(3, increment(), 1.0, 0.0004, 0.1)
+        judged(mode, increment(), 1.0, 0.0004)
     assert recorder.noise.wheel_sigma_mps == pytest.approx(9.0 * tuned)
     for _ in range(2000):
-        mode.wheels(3, increment(), 0.0, 0.0004, 0.1)
+        judged(mode, increment(), 0.0, 0.0004)
     assert recorder.noise.wheel_sigma_mps == pytest.approx(tuned / 9.0)
     steps = [(change.before, change.after) for change in recorder.changes]
     assert steps[0][0] == tuned
@@ -206,7 +213,7 @@ def test_wheels_are_doubted_once_and_believed_again_once() -> None:
     c = 12.0
     for nu in (0.1, 0.9, 0.9, 0.1, 0.1):
         w = 1.0 / (1.0 + (nu / 0.02 / c) ** 2)
-        found = mode.wheels(3, increment(), nu, 0.0004, 0.1)
+        found = judged(mode, increment(), nu, 0.0004)
         assert found.sigma.tolist() == pytest.approx([0.02 / math.sqrt(w), 0.03, 0.04, 0.05])
     doubted, believed = recorder.changes
     assert (doubted.t_ns, doubted.sensor, doubted.before) == (3, "wheels", 1.0)
