@@ -82,6 +82,11 @@ class ImuSpec:
         """Rotation matrix (3, 3): vector in the body frame = matrix @ vector in the sensor frame."""
         return axes_matrix(self.axes)
 
+    @property
+    def bias_sigma(self) -> Array:
+        """1 sigma (6,) of the biases of the accelerometer, m/s2, then of the gyro, rad/s."""
+        return np.repeat([self.accel_bias_sigma_mps2, self.gyro_bias_sigma_radps], 3)
+
 
 @dataclass(frozen=True)
 class WheelSpec:

@@ -78,10 +78,10 @@ class GnssUpdater:
         self,
         config: EstimatorConfig,
         report: Callable[[Innovation], None],
-        weighting: Weighting | None = None,
-        skid: SkidDetector | None = None,
+        weighting: Weighting,
+        skid: SkidDetector,
     ) -> None:
-        self.weighting = weighting or Weighting()
+        self.weighting, self.skid = weighting, skid
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
         self.nominal_antenna_m = self.antenna_m.copy()
         self.antenna_places = AntennaPlaces.fixed(tuple(self.antenna_m.tolist()))
@@ -92,13 +92,11 @@ class GnssUpdater:
         spec = config.rig.sensors.gnss
         self.track = DeadReckoning(self.antenna_m)
         self.turned = 0
-        self.skid = skid or SkidDetector()
         self.scale, self.white, self._applied_scale = 1.0, WHITE_SHARE, 1.0
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._class: Fix | None = None
         self._class_scale: dict[Fix | None, float] = {}
-        imu = config.rig.sensors.imu
-        self._bias_sigma = np.repeat([imu.accel_bias_sigma_mps2, imu.gyro_bias_sigma_radps], 3)
+        self._bias_sigma = config.rig.sensors.imu.bias_sigma
         self.drift_time_s = max(spec.correlation_time_s, 0.1)
         # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
         # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.

@@ -54,7 +54,7 @@ class ImuLevel:
     def __init__(self, config: EstimatorConfig, imu: ImuStream) -> None:
         spec = config.rig.sensors.imu
         self._imu, self._new = imu, False
-        self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
+        self._bias_sigma = spec.bias_sigma
         self._accel_sigma_mps2 = spec.accel_bias_sigma_mps2
         self.restart()
         self._six_axis = config.inputs.imu == "six_axis"

@@ -39,8 +39,7 @@ class ImuMounting:
     def __init__(self, config: EstimatorConfig, imu: ImuStream, skid: SkidDetector) -> None:
         self.learns = config.self_calibrate and not config.calibrate and config.inputs.imu == "six_axis"
         self._imu, self._skid, self._seen = imu, skid, MountingAngle()
-        spec = config.rig.sensors.imu
-        self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
+        self._bias_sigma = config.rig.sensors.imu.bias_sigma
         self.corrects_since_ns: int | None = None
         self.level = ImuLevel(config, imu)
         self.start_from(_prior(config.rig.known.imu_yaw_rad))

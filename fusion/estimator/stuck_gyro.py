@@ -41,7 +41,7 @@ class StuckGyro:
         self.doubt_rad = 0.0
         self._track_m, self._density = rig.track_m / yaw_factor(rig), rig.sensors.imu.gyro_noise_radps_sqrthz
         self._sides = inputs.sides
-        self.unit = GyroUnit(rig.track_m, inputs.sides)
+        self.unit = GyroUnit(rig.track_m)
         self._reading = float("nan")
         self._since_ns = 0
         self._count = 0

@@ -22,9 +22,9 @@ class GyroUnit:
         in_degrees: the last `WINDOWS` turns were those of a gyro in deg/s, or two before a breakdown.
     """
 
-    def __init__(self, track_m: float, sides: bool) -> None:
+    def __init__(self, track_m: float) -> None:
         self.in_degrees = False
-        self._track_m, self._sides = track_m, sides
+        self._track_m = track_m
         self._begin_ns: int | None = None
         self._last_ns = 0
         self._turn = 0.0
@@ -37,8 +37,6 @@ class GyroUnit:
         Raises:
             DataError: the readings are in degrees per second.
         """
-        if not self._sides:
-            return
         step_ns = t_ns - self._last_ns
         if self._begin_ns is None or not 0 <= step_ns <= LONGEST_STEP_NS or yaw_rate_radps != yaw_rate_radps:
             self._begin_ns, self._turn = t_ns, 0.0

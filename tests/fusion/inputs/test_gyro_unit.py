@@ -10,9 +10,12 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import ImuSample, Message
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.inputs.gyro_unit import WINDOWS, GyroUnit
 from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.twin.model.vehicle import load_vehicle
 from tests.fusion.estimator.live_machine import drive
 
 
@@ -46,7 +49,7 @@ def test_other_gyros_are_taken(factor: float) -> None:
 
 def turned(ratio: float, seconds: int, noise_radps: float = 0.0, turn_radps: float = 0.2) -> GyroUnit:
     """A robot that turns for a time, IMU at 50 Hz; wheels in step."""
-    wheels, unit = WheelStream(), GyroUnit(0.5, sides=True)
+    wheels, unit = WheelStream(), GyroUnit(0.5)
     noise = np.random.default_rng(0).normal(0.0, noise_radps, 50 * seconds)
     for i in range(50 * seconds):
         t_ns = i * 20_000_000
@@ -67,7 +70,7 @@ def test_it_needs_some_turns_that_agree() -> None:
 
 
 def test_right_readings_are_taken_again() -> None:
-    wheels, unit, refused = WheelStream(), GyroUnit(0.5, sides=True), 0
+    wheels, unit, refused = WheelStream(), GyroUnit(0.5), 0
     for i in range(50 * 40):
         t_ns = i * 20_000_000
         wheels.add(t_ns, 0.45, 0.55)
@@ -80,14 +83,14 @@ def test_right_readings_are_taken_again() -> None:
 
 
 def test_without_sides_there_is_nothing_to_compare() -> None:
-    unit = GyroUnit(0.5, sides=False)
-    for i in range(1000):
-        unit.check(i * 20_000_000, 60.0, WheelStream())
+    gyro = StuckGyro(load_vehicle("husky").rig(), SensorConfig(sides=False))
+    reading = np.array([0.0, 0.0, 60.0])
+    assert all(gyro.checked(i * 20_000_000, reading, WheelStream()) is reading for i in range(1000))
 
 
 def test_a_window_begun_anew_begins_without_a_turn() -> None:
     """Just below the bound, with a pause after every window."""
-    wheels, unit = WheelStream(), GyroUnit(0.5, sides=True)
+    wheels, unit = WheelStream(), GyroUnit(0.5)
     for i in range(50 * 30):
         t_ns = i * 20_000_000
         wheels.add(t_ns, 0.45, 0.55)
