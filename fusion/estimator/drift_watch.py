@@ -49,6 +49,16 @@ TELLING = 0.1
 """Least share of a move that the estimate can show."""
 
 
+@dataclass(frozen=True)
+class Drift:
+    """An estimate of the drift; `variance_m2`: mean of both axes."""
+
+    t_ns: int
+    east_m: float
+    north_m: float
+    variance_m2: float
+
+
 @dataclass
 class DriftWatch:
     """Estimates of the drift, and the sigma learned from them.
@@ -56,42 +66,44 @@ class DriftWatch:
     Attributes:
         sigma_m, time_s: of the drift's Gauss-Markov process; sigma as learned.
         fresh: fixes that show the drift came into the graph since the last test.
-        seen: time, drift east and north, m, and mean variance of it, m2.
+        seen: the last estimates.
         sheet_m: sigma by the data sheet, the largest.
-        _reference: estimate, as in `seen`, from which the next move is learned.
+        _reference: estimate from which the next move is learned.
     """
 
     sigma_m: float
     time_s: float
     fresh: bool = False
-    seen: list[tuple[int, float, float, float]] = field(default_factory=list)
+    seen: list[Drift] = field(default_factory=list)
     sheet_m: float = field(init=False)
-    _reference: tuple[int, float, float, float] | None = None
+    _reference: Drift | None = None
     _moves: float = 0.0
 
     def __post_init__(self) -> None:
         self.sheet_m = self.sigma_m
 
-    def learn(self, t_ns: int, drift_m: Array, variance_m2: float, least_m: float) -> None:
-        """Follow the moves of the drift, (2,) m, with sigma between `least_m` and the data sheet's.
-
-        `variance_m2` is that of an axis of the estimate.
+    def _move(self, before: Drift, now: Drift) -> tuple[tuple[float, float], float, float]:
+        """A move east and north, m, the variance of it that a consistent filter has, and that of the drift
+        itself, m2 an axis.
         """
-        east_m, north_m = drift_m.tolist()
+        kept = math.exp(-(now.t_ns - before.t_ns) * 1e-9 / self.time_s)
+        new_m2 = self.sigma_m**2 * (1.0 - kept**2)
+        moved_m = now.east_m - kept * before.east_m, now.north_m - kept * before.north_m
+        return moved_m, kept**2 * before.variance_m2 + new_m2 - now.variance_m2, new_m2
+
+    def learn(self, now: Drift, least_m: float) -> None:
+        """Follow the moves of the drift, with sigma between `least_m` and the data sheet's."""
         if self._reference is not None:
-            before_ns, e_m, n_m, before_m2 = self._reference
-            kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
-            if t_ns - before_ns < LEARNED_S * 1e9:
+            if now.t_ns - self._reference.t_ns < LEARNED_S * 1e9:
                 return
-            new_m2 = self.sigma_m**2 * (1.0 - kept**2)
-            expected_m2 = kept**2 * before_m2 + new_m2 - variance_m2
+            (x_m, y_m), expected_m2, new_m2 = self._move(self._reference, now)
             if expected_m2 > TELLING * new_m2:
-                square = ((east_m - kept * e_m) ** 2 + (north_m - kept * n_m) ** 2) / (2.0 * expected_m2)
+                square = (x_m**2 + y_m**2) / (2.0 * expected_m2)
                 self._moves = min(self._moves + 1.0, MOST_MOVES)
                 gain = 1.0 / (PRIOR_MOVES + self._moves)
                 sigma_m = self.sigma_m * math.sqrt(1.0 + gain * (min(square, LARGEST_MOVE) - 1.0))
                 self.sigma_m = min(max(sigma_m, least_m), self.sheet_m)
-        self._reference = t_ns, east_m, north_m, variance_m2
+        self._reference = now
 
     def test_wheels(
         self, chain: Chain, skid: SkidDetector, sigma_m: float, noise: SensorNoise, least_m: float
@@ -100,33 +112,30 @@ class DriftWatch:
         by what the fixes report."""
         if not self.fresh:
             return
-        drift_m = chain.state(chain.last).of(DRIFT)
         P = chain.covariance_at(chain.last)
-        t_ns, variance_m2 = chain.nodes[-1].t_ns, 0.5 * float(np.trace(P[DRIFT, DRIFT]))
-        self.learn(t_ns, drift_m, variance_m2, least_m)
-        moved = self.moved_too_far(t_ns, drift_m, variance_m2)
+        east_m, north_m = chain.state(chain.last).of(DRIFT).tolist()
+        now = Drift(chain.nodes[-1].t_ns, east_m, north_m, 0.5 * float(np.trace(P[DRIFT, DRIFT])))
+        self.learn(now, least_m)
+        moved = self.moved_too_far(now)
         if moved is None or P[2, 2] > MOST_YAW_RAD**2:
             return
         since_ns, moved_m = moved
         if skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
             self.restart()
 
-    def moved_too_far(self, t_ns: int, drift_m: Array, variance_m2: float) -> tuple[int, Array] | None:
+    def moved_too_far(self, now: Drift) -> tuple[int, Array] | None:
         """Take an estimate in; since when and how far, (2,) m, it moved faster than a receiver drifts.
 
         None where it did not.
         """
-        self.seen = [one for one in self.seen if 0 < t_ns - one[0] <= WINDOW_S * 1e9]
+        self.seen = [one for one in self.seen if 0 < now.t_ns - one.t_ns <= WINDOW_S * 1e9]
         found = None
-        east_m, north_m = drift_m.tolist()
-        for before_ns, e_m, n_m, before_m2 in self.seen:
-            kept = math.exp(-(t_ns - before_ns) * 1e-9 / self.time_s)
-            new_m2 = self.sigma_m**2 * (1.0 - kept**2)
-            allowed_m2 = max(kept**2 * before_m2 + new_m2 - variance_m2, new_m2)
-            if (east_m - kept * e_m) ** 2 + (north_m - kept * n_m) ** 2 > LIMIT * allowed_m2:
-                found = before_ns, drift_m - kept * np.array([e_m, n_m])
+        for before in self.seen:
+            (x_m, y_m), expected_m2, new_m2 = self._move(before, now)
+            if x_m**2 + y_m**2 > LIMIT * max(expected_m2, new_m2):
+                found = before.t_ns, np.array([x_m, y_m])
                 break
-        self.seen.append((t_ns, east_m, north_m, variance_m2))
+        self.seen.append(now)
         return found
 
     def restart(self) -> None:
