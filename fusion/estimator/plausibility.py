@@ -31,10 +31,10 @@ from terrafusion.fusion.inputs.validation import GnssFix
 
 SLACK_M, SLACK_SIGMA = 1.0, 4.0
 """Beyond the reach of the wheels: lever arm and delay (assumed), and sigmas of both fixes."""
-EVIDENCE_FIXES, EVIDENCE_S, EVIDENCE_M = 10, 20.0, 20.0
-"""Fixes, time and path that a place beyond reach must show."""
+SHAPE_FIXES, EVIDENCE_S, EVIDENCE_M = 10, 20.0, 20.0
+"""Fixes from which their path has a shape, and time and path that a place beyond reach must show."""
 SHAPE_RATIO, SHAPE_SHARE, SHAPE_SIGMA = 0.15, 0.03, 3.0
-"""How well their path must match that of wheels and gyro: in scale, and in share of the path plus sigmas."""
+"""How well the shape must be that of wheels and gyro: in scale, and in share of the path plus sigmas."""
 CONTRADICTED = 5
 """Fixes in a row beyond reach that put the estimate in doubt."""
 BRIEF_S, FORGOTTEN_S = 5.0, 10.0
@@ -47,8 +47,8 @@ REPEATED_SIGMA, REPEATED_M = 0.1, 0.005
 """A position is repeated where it changes by less than this share of sigma, at most by so much."""
 REPEATED_WAY_M = 0.1
 """Least motion that a repeated position contradicts; one sigma of the fix where that is more."""
-MIRROR_FIXES, MIRROR_GAIN = 10, 5.0
-"""Fixes, and ratio of residuals, from which the path fits its mirror image only."""
+MIRROR_GAIN = 5.0
+"""Ratio of residuals from which the path fits its mirror image only."""
 MIRROR_YAW_RAD = 1.8
 """Sigma of a heading of which nothing is known: pi / sqrt(3)."""
 MIRROR_RATIO = 0.3
@@ -80,19 +80,12 @@ class FixRun:
 
         `heading` turns the path as the estimate has it; a straight path must have that heading.
         """
-        if len(self.pairs) < EVIDENCE_FIXES or self.seconds() < EVIDENCE_S:
+        shape = PathShape.of(self.pairs, scale)
+        if self.seconds() < EVIDENCE_S or shape.path_m < EVIDENCE_M or not shape.fits(shape.own, SHAPE_RATIO):
             return False
-        z, fix = (np.array([getattr(p, name) for p in self.pairs]) for name in ("z", "fix"))
-        path_m = float(np.abs(np.diff(z)).sum())
-        if path_m < EVIDENCE_M:
-            return False
-        turn, left_m = similarity(z, fix)
-        sigma_m = scale * max(p.sigma_m for p in self.pairs)
-        allowed_m = SHAPE_SIGMA * sigma_m + SHAPE_SHARE * path_m
-        if abs(abs(turn) - 1.0) > SHAPE_RATIO or left_m > allowed_m:
-            return False
+        turn, left_m = shape.own
         other = abs(cmath.phase(turn / heading)) > LEAST_TURN_RAD
-        return not other or similarity(z.conj(), fix)[1] > MIRROR_GAIN * max(left_m, sigma_m)
+        return not other or shape.mirrored[1] > MIRROR_GAIN * max(left_m, shape.sigma_m)
 
 
 @dataclass
@@ -291,37 +284,43 @@ class PathShape:
     """How well fixes trace the path of wheels and gyro, and its mirror image.
 
     Attributes:
-        own_m, mirrored_m: median distances left.
-        own, mirrored: whether the path, or its image, fits: in scale, and within `allowed_m`.
+        own, mirrored: `similarity` of the path, and of its image, to the fixes.
+        sigma_m: the largest of the fixes.
+        path_m: length of the path; 0 with too few fixes.
     """
 
-    own_m: float
-    mirrored_m: float
-    own: bool
-    mirrored: bool
-    sigma_m: float
+    own: tuple[complex, float] = (0j, 0.0)
+    mirrored: tuple[complex, float] = (0j, 0.0)
+    sigma_m: float = 0.0
+    path_m: float = 0.0
 
     @classmethod
-    def of(cls, pairs: list[FixPair]) -> PathShape:
-        """The shape of fixes."""
-        if len(pairs) < MIRROR_FIXES:
-            return cls(0.0, 0.0, False, False, 0.0)
+    def of(cls, pairs: list[FixPair], scale: float = 1.0) -> PathShape:
+        """The shape of fixes, their sigmas times `scale`."""
+        if len(pairs) < SHAPE_FIXES:
+            return cls()
         z, fix = (np.array([getattr(p, name) for p in pairs]) for name in ("z", "fix"))
-        sigma_m = max(p.sigma_m for p in pairs)
-        allowed_m = SHAPE_SIGMA * sigma_m + SHAPE_SHARE * float(np.abs(np.diff(z)).sum())
-        fits = [similarity(path, fix) for path in (z, z.conj())]
-        own, mirrored = (abs(abs(a) - 1.0) <= MIRROR_RATIO and m <= allowed_m for a, m in fits)
-        return cls(fits[0][1], fits[1][1], own, mirrored, sigma_m)
+        sigma_m = scale * max(p.sigma_m for p in pairs)
+        path_m = float(np.abs(np.diff(z)).sum())
+        return cls(similarity(z, fix), similarity(z.conj(), fix), sigma_m, path_m)
+
+    def fits(self, one: tuple[complex, float], ratio: float) -> bool:
+        """Whether the path, or its image, fits: its scale within `ratio` of 1."""
+        turn, left_m = one
+        allowed_m = SHAPE_SIGMA * self.sigma_m + SHAPE_SHARE * self.path_m
+        return abs(abs(turn) - 1.0) <= ratio and left_m <= allowed_m
 
     def is_mirrored(self) -> bool:
         """Whether only the image fits, clearly."""
-        clearly_m = max(MIRROR_GAIN * self.mirrored_m, 2.0 * SHAPE_SIGMA * self.sigma_m)
-        return self.mirrored and self.own_m > clearly_m
+        return self._fits_alone(self.mirrored, self.own)
 
     def is_own(self) -> bool:
         """Whether only the path itself fits, clearly."""
-        clearly_m = max(MIRROR_GAIN * self.own_m, 2.0 * SHAPE_SIGMA * self.sigma_m)
-        return self.own and self.mirrored_m > clearly_m
+        return self._fits_alone(self.own, self.mirrored)
+
+    def _fits_alone(self, one: tuple[complex, float], other: tuple[complex, float]) -> bool:
+        clearly_m = max(MIRROR_GAIN * one[1], 2.0 * SHAPE_SIGMA * self.sigma_m)
+        return self.fits(one, MIRROR_RATIO) and other[1] > clearly_m
 
 
 def plausible_fixes(fixes: list[GnssFix], wheels: WheelStream) -> list[GnssFix]:
