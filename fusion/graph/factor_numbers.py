@@ -90,10 +90,6 @@ _KINDS: dict[str, Callable[[list[int], Any], Any]] = {
         *keys, gtsam.imuBias.ConstantBias(), noise
     ),
     "PriorFactorVector": lambda keys, noise: _GTSAM.PriorFactorVector(*keys, np.zeros(noise.dim()), noise),
-    "PriorFactorPose3": lambda keys, noise: _GTSAM.PriorFactorPose3(*keys, gtsam.Pose3(), noise),
-    "PriorFactorConstantBias": lambda keys, noise: _GTSAM.PriorFactorConstantBias(
-        *keys, gtsam.imuBias.ConstantBias(), noise
-    ),
     "GPSFactorArm": lambda keys, noise: _GTSAM.GPSFactorArm(*keys, np.zeros(3), np.zeros(3), noise),
     "AttitudeFactorPose3": lambda keys, noise: _GTSAM.AttitudeFactorPose3(
         *keys, gtsam.Unit3(0.0, 0.0, 1.0), noise, gtsam.Unit3(0.0, 0.0, 1.0)

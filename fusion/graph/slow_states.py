@@ -1,21 +1,15 @@
 """Priors and processes of the linear states."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.key_state import ICR_X, LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise
-
-if TYPE_CHECKING:
-    from terrafusion.fusion.graph.chain import Chain
-
 
 SLIP_STEADY = 30.0
 """Correlation time of slip at constant wheel speed over the policy's, which is that of whole runs with

@@ -63,6 +63,7 @@ class TerrainNoise:
         self.adaptive = config.mode == "adaptive"
         model = (config.terrain_model or load_terrain_model()).for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
+        self._unknown = self.detector.classes.index(UNKNOWN)
         self._labels = config.labels
         self._claimed: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
@@ -104,8 +105,7 @@ class TerrainNoise:
             return
         self._slip_times_s = np.minimum(self.policy.slips()[3], time_s)
         if self._starts_pooled:
-            own = self.detector.classes.index(UNKNOWN)
-            self._ground_slip.expect(mean, sigma, float(self._slip_times_s[own]))
+            self._ground_slip.expect(mean, sigma, float(self._slip_times_s[self._unknown]))
         self._reweight(t_ns)
 
     def learned_grounds(self) -> GroundMemory | None:
@@ -147,7 +147,7 @@ class TerrainNoise:
         moved = 0.5 * float(np.abs(p - self._before).sum())
         self._before = p
         found = self._ground_slip.take_switch() if self._starts_pooled else 0.0
-        return max(moved, found * float(p[self.detector.classes.index(UNKNOWN)]))
+        return max(moved, found * float(p[self._unknown]))
 
     def begin(self, t_ns: int) -> None:
         """Start the clock; the first noise is a change from the policy's fixed one."""
@@ -212,7 +212,7 @@ class TerrainNoise:
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
             self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
             self._ground_slip.recognise(self.grounds.memory.belief)
-            if self.detector.classes[int(self._probabilities.argmax())] == UNKNOWN:
+            if int(self._probabilities.argmax()) == self._unknown:
                 name = self.grounds.memory.most_probable()
                 self._on_found_s[name] = self._on_found_s.get(name, 0.0) + window.dt_s
         self._learn_driven_slip(window)
@@ -285,9 +285,8 @@ class TerrainNoise:
         p = self.detector.probabilities
         if self._starts_pooled:
             p = np.maximum(2.0 * p - 1.0, 0.0)
-            unknown = self.detector.classes.index(UNKNOWN)
-            p[unknown] = 0.0
-            p[unknown] = 1.0 - p.sum()
+            p[self._unknown] = 0.0
+            p[self._unknown] = 1.0 - p.sum()
         return self._with_label(p)
 
     def _reweight(self, t_ns: int) -> None:
@@ -295,8 +294,8 @@ class TerrainNoise:
             return
         p = self._probabilities
         if self._starts_pooled:
-            own = self.detector.classes.index(UNKNOWN)
-            self._slips[0][own], self._slips[1][own] = self._ground_slip.mean, self._ground_slip.sigma
+            mean, sigma = self._slips
+            mean[self._unknown], sigma[self._unknown] = self._ground_slip.mean, self._ground_slip.sigma
         self.noise = self.policy.blend(self._shares, self._grade, (*self._slips, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return
@@ -314,7 +313,7 @@ class TerrainNoise:
         best = int(p.argmax())
         found = self.grounds.memory if self.grounds and self._starts_pooled else GroundMemory()
         own, by_label = found.most_probable(), self._believes_label()
-        if own and not by_label and self.detector.classes[best] == UNKNOWN:
+        if own and not by_label and best == self._unknown:
             return f"{own} p = {found.belief.max():.2f} (found while driving)"
         return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
 
