@@ -16,7 +16,7 @@ from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import key_state_of
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, quaternion_of
-from terrafusion.fusion.graph.triangular import back_substitute
+from terrafusion.fusion.graph.triangular import back_substitute_before
 
 
 def in_map(frame: str) -> bool:
@@ -67,8 +67,7 @@ def _smoothed_before(chain: Chain) -> gtsam.Pose3:
 
     A change of ground that is detected late moves both; their difference alone is the motion between them.
     """
-    node, dim = chain.nodes[-2], chain.dim
+    node, newest = chain.nodes[-2:]
     assert node.conditional is not None
-    following = node.conditional[:, dim : 2 * dim] @ chain.nodes[-1].delta
-    delta = back_substitute(node.conditional[:, :dim], node.conditional[:, 2 * dim] - following)
+    (delta,) = back_substitute_before([node.conditional], newest.delta)
     return node.point.pose.retract(delta[POSE])

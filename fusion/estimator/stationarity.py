@@ -17,6 +17,7 @@ import math
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import V
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -131,7 +132,7 @@ class StationarityDetector:
         before: KeyState,
         aided: bool,
     ) -> None:
-        """Zero-velocity update of the newest keyframe where the robot has stood for a window.
+        """Zero velocity at the newest keyframe, and no motion in its link, where the robot has stood.
 
         `link` leads to it from the keyframe with the state `before`; `aided`: fixes hold the estimate.
         """
@@ -139,7 +140,8 @@ class StationarityDetector:
         biases = before.bias.gyroscope(), before.bias.accelerometer()
         speed_mps, t_ns = math.sqrt(before.velocity @ before.velocity), chain.nodes[-1].t_ns
         if self.is_stationary(t_ns, imu, wheels, *biases, speed_mps, sigma_mps):
-            _add_zero_velocity(chain, link)
+            link.add(no_motion_factor(chain.last))
+            chain.add(chain.last, gtsam.PriorFactorVector(V(chain.last), np.zeros(3), _STOPPED))
 
 
 def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
@@ -163,13 +165,6 @@ def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix])
     wheels.forget(cut)
     fixes[:] = [fix for fix in fixes if fix.t_ns >= cut]
     return True
-
-
-def _add_zero_velocity(chain: Chain, link: gtsam.NonlinearFactorGraph) -> None:
-    """Zero velocity at the newest keyframe, and in its `link` no motion since the one before."""
-    k = chain.last
-    link.add(no_motion_factor(k))
-    chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED))
 
 
 def noise_at_rest(spec: ImuSpec, rate_hz: float, gyro: Array, accel: Array) -> tuple[float, float]:

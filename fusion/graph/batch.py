@@ -10,19 +10,19 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.graph.keyframe_rows import carried_prior, insert
+from terrafusion.fusion.graph.keyframe_rows import carried_prior
 from terrafusion.fusion.graph.triangular import (
     back_substitute,
     back_substitute_before,
     eliminated,
     triangular,
 )
+from terrafusion.fusion.graph.variables import insert, retracted, state_of
 
 BLOCK = 500
 """Keyframes whose rows are held at a time."""
@@ -42,7 +42,6 @@ class BatchSmoother:
         nodes = chain.nodes
         points = [*(node.point for node in nodes[: len(nodes) - len(initial)]), *initial]
         self.dim, self.first, self.size = chain.dim, chain.first, len(nodes)
-        self._keys = [(X(k), V(k), B(k)) for k in range(self.first, self.first + self.size)]
         self.values = gtsam.Values()
         for k, point in enumerate(points, self.first):
             insert(self.values, k, point)
@@ -84,11 +83,7 @@ class BatchSmoother:
 
     def states(self) -> list[KeyState]:
         """The states of all keyframes."""
-        at = self.values
-        return [
-            KeyState(at.atPose3(x), at.atVector(v), at.atConstantBias(b), linear)
-            for (x, v, b), linear in zip(self._keys, self.linear, strict=True)
-        ]
+        return [state_of(self.values, k, linear) for k, linear in enumerate(self.linear, self.first)]
 
     def covariances(self) -> Array:
         """Marginal covariances (n, dim, dim) of all keyframes, at the last linearisation."""
@@ -116,7 +111,8 @@ class BatchSmoother:
         self.iterations += 1
         dim = self.dim
         poses = gtsam.utilities.extractPose3(values)
-        known = self._first_prior(values, linear[0])
+        offset = self._made_at.local(state_of(values, self.first, linear[0]))
+        known = carried_prior(self._prior, offset)
         error = float(known[:, dim] @ known[:, dim])
         for block in self._blocks:
             rows, counts = block.rows(values, linear, poses)
@@ -129,12 +125,6 @@ class BatchSmoother:
                 else:
                     self._conditionals[i], known = eliminated(stacked, known)
         return error
-
-    def _first_prior(self, values: gtsam.Values, linear: Array) -> Array:
-        """The prior (m, dim + 1) of the first keyframe, carried to where the keyframe is now."""
-        x, v, b = self._keys[0]
-        now = KeyState(values.atPose3(x), values.atVector(v), values.atConstantBias(b), linear)
-        return carried_prior(self._prior, self._made_at.local(now))
 
     def _solve(self) -> Array:
         """The step (n, dim) of all keyframes."""
@@ -151,11 +141,6 @@ class BatchSmoother:
         return float(np.sqrt(np.einsum("kr,kr->", right, right) + np.sum(self._root[:, -1] ** 2)))
 
     def _moved(self, step: Array) -> tuple[gtsam.Values, Array]:
-        delta = gtsam.VectorValues()
-        for (x, v, b), row in zip(self._keys, step, strict=True):
-            delta.insert(x, row[0:6])
-            delta.insert(v, row[6:9])
-            delta.insert(b, row[9:15])
         linear = self.linear.copy()
         linear[:, : self.dim - 15] += step[:, 15:]
-        return self.values.retract(delta), linear
+        return retracted(self.values, self.first, step), linear

@@ -15,22 +15,18 @@ import bisect
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import lapack
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import BIAS, NAV, POSE, VELOCITY, KeyState, dim_of
+from terrafusion.fusion.graph.key_state import NAV, VELOCITY, KeyState, dim_of
 from terrafusion.fusion.graph.keyframe_rows import (
-    SYMBOLS,
     carried_prior,
-    insert,
     link_rows,
     measured_rows,
     own_rows,
@@ -43,6 +39,7 @@ from terrafusion.fusion.graph.triangular import (
     eliminated,
     triangular,
 )
+from terrafusion.fusion.graph.variables import erase, insert, retracted, state_of, update
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
@@ -95,12 +92,12 @@ class Chain:
         `link` must touch X, V and B of both keyframes; `markov` links the linear states.
         """
         link = link if link is not None else gtsam.NonlinearFactorGraph()
-        node = self._node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
-        self.nodes.append(node)
+        parts = link, markov, wheels, gyro_radps, accel_mps2, preintegrated
+        self.nodes.append(Node(point, t_ns, np.zeros((0, self.dim + 1)), np.zeros(self.dim), *parts))
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
-            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
+            self.archive.append(t_ns, point, *parts)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor) -> None:
@@ -207,15 +204,13 @@ class Chain:
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
         while len(self.nodes) > keep and self._dirty > self.first:
-            self._erase(self.first, self.first + 1)
+            self._erase_before(self.first + 1)
             self.nodes.pop(0)
             self.first += 1
 
-    def _erase(self, begin: int, end: int) -> None:
-        """Erase the variables of GTSAM of the keyframes `begin` to `end - 1`."""
-        for k in range(begin, min(end, self._inserted)):
-            for symbol, _ in SYMBOLS:
-                self.values.erase(symbol(k))
+    def _erase_before(self, end: int) -> None:
+        for k in range(self.first, min(end, self._inserted)):
+            erase(self.values, k)
 
     def restart(
         self,
@@ -242,10 +237,10 @@ class Chain:
         root = np.linalg.inv(np.linalg.cholesky(marginal + np.diag(extra_variance)))
         # Keyframes that follow keep their linearisation, so keyframe k must keep its own, too.
         shift = mean if k == self.last else np.zeros(self.dim)
-        point, empty = at or node.point.retract(shift), gtsam.NonlinearFactorGraph()
-        fresh = self._node(point, node.t_ns, empty, None, None, node.gyro_radps, node.accel_mps2, False)
-        fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
-        self._erase(self.first, k)
+        point, prior = at or node.point.retract(shift), np.hstack([root, (root @ (mean - shift))[:, None]])
+        fresh = Node(point, node.t_ns, prior, np.zeros(self.dim))
+        fresh.gyro_radps, fresh.accel_mps2 = node.gyro_radps, node.accel_mps2
+        self._erase_before(k)
         self.nodes, self.first, self._dirty = [fresh, *self.nodes[k - self.first + 1 :]], k, k
         self._anchor = None
         self._publish(k)
@@ -293,9 +288,6 @@ class Chain:
         self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((self.dim, 1))])
         self._dirty = self.first
 
-    def _node(self, *parts: Any) -> Node:
-        return Node(*(*parts, np.zeros((0, self.dim + 1)), np.zeros(self.dim)))
-
     def _insert_new(self) -> None:
         """Insert the variables of the keyframes that GTSAM does not have yet."""
         self._inserted = max(self._inserted, self.first)
@@ -327,29 +319,20 @@ class Chain:
     def _relinearise(self) -> None:
         """Make the estimates of all keyframes held their linearisation points, and eliminate anew."""
         self._carry_prior()
-        delta = gtsam.VectorValues()
-        for k, node in enumerate(self.nodes, self.first):
-            delta.insert(X(k), node.delta[POSE])
-            delta.insert(V(k), node.delta[VELOCITY])
-            delta.insert(B(k), node.delta[BIAS])
-        self.values = now = self.values.retract(delta)
+        self.values = retracted(self.values, self.first, (node.delta for node in self.nodes))
         for k, node in enumerate(self.nodes, self.first):
             linear = node.point.linear.copy()
             linear[: self.dim - NAV.stop] += node.delta[NAV.stop :]
-            node.point = KeyState(now.atPose3(X(k)), now.atVector(V(k)), now.atConstantBias(B(k)), linear)
-            node.delta = np.zeros(self.dim)
+            node.point, node.delta = state_of(self.values, k, linear), np.zeros(self.dim)
         block = RowBlock(self.nodes, self.first, self.first, self.last + 1)
-        rows, counts = block.rows(now, np.array([node.point.linear for node in self.nodes]))
+        rows, counts = block.rows(self.values, np.array([node.point.linear for node in self.nodes]))
         for node, after, own, count in zip(self.nodes, self.nodes[1:], rows, counts, strict=False):
             node.conditional, after.prior = eliminated(own[:count], node.prior)
         self._dirty = self.last
 
     def _publish(self, k: int) -> None:
         self._insert_new()
-        node = self.nodes[k - self.first]
-        self.values.update(X(k), pose3=node.point.pose)
-        self.values.update(V(k), vector=node.point.velocity)
-        self.values.update(B(k), constant_bias=node.point.bias)
+        update(self.values, k, self.nodes[k - self.first].point)
 
     def _stacked(self, k: int) -> Array:
         """Prior and all whitened rows over keyframes k and k + 1, shape (m, 2 dim + 1)."""

@@ -5,27 +5,18 @@ The last column of rows is the right-hand side; rows over two keyframes have the
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph import gnss_factor, velocity_factor
-from terrafusion.fusion.graph.key_state import BIAS, DIM, IMU_ROTATION, NAV, POSE, VELOCITY, KeyState, skew
+from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, NAV, POSE, skew
 from terrafusion.fusion.graph.node import Node
+from terrafusion.fusion.graph.variables import VARIABLES
 from terrafusion.fusion.graph.wheel_factor import linearised
 
-SYMBOLS = ((X, POSE), (V, VELOCITY), (B, BIAS))
 WHEEL_ROWS = 4
 _PLACES = np.arange(DIM - NAV.stop)
 _IN_TIME_ORDER = np.r_[0:9, 18:24, 9:18, 24:31]
 """Columns of a `CombinedImuFactor`, keyframe by keyframe."""
-
-
-def insert(values: gtsam.Values, k: int, point: KeyState) -> None:
-    """Insert the variables of keyframe k."""
-    # By keyword: without, Python's binding tries 43 other types before the bias, for 25 us.
-    values.insert(X(k), pose3=point.pose)
-    values.insert(V(k), vector=point.velocity)
-    values.insert(B(k), constant_bias=point.bias)
 
 
 def own_rows(node: Node, k: int, values: gtsam.Values, further: int = 0, width: int = 1) -> Array:
@@ -57,7 +48,7 @@ def _measured_rows(node: Node, k: int, values: gtsam.Values) -> list[Array]:
 
 def _gtsam_rows(node: Node, k: int, values: gtsam.Values) -> Array:
     dim, keys = len(node.delta), set(node.unary.keyVector())
-    touched = [(symbol(k), place) for symbol, place in SYMBOLS if symbol(k) in keys]
+    touched = [(symbol(k), place) for symbol, place in VARIABLES if symbol(k) in keys]
     ordering = gtsam.Ordering()
     for key, _ in touched:
         ordering.push_back(key)
@@ -102,7 +93,7 @@ def linearised_link(node: Node, k: int, values: gtsam.Values) -> Array:
         return np.asarray(link.at(0).linearize(values).augmentedJacobian()[:, _IN_TIME_ORDER])
     ordering = gtsam.Ordering()
     for i in (k - 1, k):
-        for symbol in (X, V, B):
+        for symbol, _ in VARIABLES:
             ordering.push_back(symbol(i))
     return np.asarray(link.linearize(values).augmentedJacobian(ordering))
 

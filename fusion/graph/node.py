@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import gtsam
+import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
@@ -24,14 +25,14 @@ class Node:
 
     point: KeyState
     t_ns: int
-    link: gtsam.NonlinearFactorGraph
-    markov: MarkovStep | None
-    wheels: WheelIncrement | None
-    gyro_radps: Array
-    accel_mps2: Array
-    preintegrated: bool
     prior: Array
     delta: Array
+    link: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    markov: MarkovStep | None = None
+    wheels: WheelIncrement | None = None
+    gyro_radps: Array = field(default_factory=lambda: np.zeros(3))
+    accel_mps2: Array = field(default_factory=lambda: np.zeros(3))
+    preintegrated: bool = False
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     fixes: list[GnssPosition] = field(default_factory=list)
     velocities: list[GnssVelocity] = field(default_factory=list)
