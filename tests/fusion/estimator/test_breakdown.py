@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.graph.chain import Chain
 from tests.fusion.estimator.live_machine import drive
 
 
@@ -43,7 +44,8 @@ def test_a_state_that_is_not_finite_is_not_given(monkeypatch: pytest.MonkeyPatch
     estimator, rest = Estimator.for_vehicle("elevate"), iter(drive())
     while estimator.latest() is None:
         estimator.add(next(rest))
-    monkeypatch.setattr(estimator.chain, "covariance", lambda: np.full((estimator.chain.dim,) * 2, np.nan))
+    unknown = property(lambda chain: np.full((chain.dim, chain.dim), np.nan))
+    monkeypatch.setattr(Chain, "covariance", unknown)
     with pytest.raises(DataError, match="starts anew"):
         add_all(estimator, rest)
 
