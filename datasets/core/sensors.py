@@ -177,6 +177,11 @@ class Rig:
     known: SensorNumbers = field(default_factory=SensorNumbers)
 
     @property
+    def quantum_m(self) -> float:
+        """Travel of a wheel for one count of its encoder, m."""
+        return self.sensors.wheels.quantum_rad * self.wheel_radius_m
+
+    @property
     def ahead_m(self) -> float:
         """How far the body's origin, midway between the axles, lies ahead of the point that follows the
         wheels: the middle of the rear axle where the front wheels alone steer, else the origin itself.

@@ -92,11 +92,11 @@ class BarometerAiding(BiasedSensor[float]):
             self._forget_offset()
         key = chain.state(chain.last)
         lever = np.array(self.spec.position_m)
-        jacobian = height_jacobian(key.pose.rotation().matrix(), lever)
+        jacobian = height_jacobian(key.rotation, lever)
         was, now = (float(jacobian @ P[POSE, POSE] @ jacobian) for P in (before, after))
         if self.bias is not None:
             self.bias.state_updated(was, now)
-        height = float((key.pose.translation() + key.pose.rotation().matrix() @ lever)[2])
+        height = float(key.place_of(lever)[2])
         self._gather(t_ns, newest_ns, height, key)
         if self._due_ns is None:
             self._due_ns = t_ns + INTERVAL_NS

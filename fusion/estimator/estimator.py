@@ -315,15 +315,16 @@ class Estimator:
             segments = with_centripetal_force(segments, before)
         gap, turn = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns), None
         if gap and self.config.inputs.sides and self._turn is None:
-            stretch = self.wheels.travelled(before_ns, t_ns), self.config.rig.track_m, dt
-            turn, segments = imu_gap.turn_in_gap(before, *stretch, segments)
+            sides_m, track_m = self.wheels.travelled(before_ns, t_ns), self.config.rig.track_m
+            turn, segments = imu_gap.turn_in_gap(before, sides_m, track_m, dt, segments)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         noise = self.learned.with_doubt(noise, t_ns, segments)
         if self.config.inputs.planar and wheels is not None:
             segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt)
         if self._skid.friction is not None:
-            link_inputs = t_ns, dt, segments, wheels, before, self.chain.covariance, self._skid.rate_m2ps
-            segments, wheels = self._skid.friction.step(*link_inputs)
+            segments, wheels = self._skid.friction.step(
+                t_ns, dt, segments, wheels, before, self.chain.covariance, self._skid.rate_m2ps
+            )
         k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:
@@ -394,11 +395,11 @@ class Estimator:
         if travelled is None:
             return None
         rig, inputs, bias_z = self.config.rig, self.config.inputs, float(before.bias.gyroscope()[2])
-        quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
-        change = self.wheels.speed_change_mps(before_ns, t_ns)
-        noise, calibrates, lag_s = self.weights.noise, self.config.calibrate, self.learned.course_lag_s()
-        path = travelled, segments, bias_z, rig.track_m, quantum_m
-        increment = self._jitter.applied(wheel_increment(*path, noise, change, calibrates, lag_s))
+        increment = wheel_increment(
+            travelled, segments, bias_z, rig.track_m, rig.quantum_m, self.weights.noise,
+            self.wheels.speed_change_mps(before_ns, t_ns), self.config.calibrate, self.learned.course_lag_s(),
+        )  # fmt: skip
+        increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
             return self._turn.between(before_ns, t_ns, increment, self.steering, self.chain.covariance)

@@ -229,7 +229,7 @@ class FrictionEstimator:
         wheels: WheelIncrement,
         before: KeyState,
     ) -> None:
-        R = before.pose.rotation().matrix()
+        R = before.rotation
         if self._velocity is None:
             self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
             here = np.tile((R @ self.antenna_m)[:2], (len(FRICTION_MPS2) + 1, 1))
@@ -275,7 +275,7 @@ class FrictionEstimator:
         Where the wheels hold, the displacement is as accurate as the wheels; where they skid, the
         acceleration has `SKID_DENSITY_MPS2` and the displacement the accuracy of the speed.
         """
-        R = before.pose.rotation().matrix()
+        R = before.rotation
         start = (R.T @ before.velocity)[:2]
         starts = start + np.array([[0.0, 0.0], [_STEP_MPS, 0.0], [0.0, _STEP_MPS]])
         friction, spread = self._moments()

@@ -26,7 +26,7 @@ from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
-from terrafusion.fusion.graph.key_state import BIAS, DRIFT, NAV, POSE, SLIP, VELOCITY
+from terrafusion.fusion.graph.key_state import BIAS, DRIFT, NAV, POSE, SLIP, VELOCITY, KeyState
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
@@ -242,9 +242,8 @@ class GnssUpdater:
 
     def _antenna(self, chain: Chain, k: int) -> complex:
         """The antenna at keyframe k by the estimate, east + i north, m."""
-        state = chain.state(k)
-        at = state.pose.translation() + state.rotation @ self.antenna_m
-        return complex(at[0], at[1])
+        east_m, north_m, _ = chain.state(k).place_of(self.antenna_m).tolist()
+        return complex(east_m, north_m)
 
     def _gated(self, chain: Chain, k: int, innovation_m: Array, S: Array) -> tuple[GateDecision, float]:
         """Verdict of the gate and of plausibility on the newest fix, and the normalised square."""
@@ -274,11 +273,10 @@ class GnssUpdater:
             if k is None:
                 continue
             at, share = AntennaMotion.of(archive, k, fix, self.antenna_m), self._drift_share(fix, inflation)
-            sigma, enu_m = self._white_sigma(fix, inflation, share), fix.enu_m
-            if not math.isfinite(enu_m[2] + sigma[2]):
-                height = (np.asarray(archive.state(k).pose.translation()) + at.R @ at.lever_m)[2]
-                sigma, enu_m = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M), np.append(enu_m[:2], height)
-            archive.add_fix(k, GnssPosition(enu_m, at.lever_m, sigma, share, at.velocity_mps))
+            sigma = self._white_sigma(fix, inflation, share)
+            position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps)
+            known = math.isfinite(fix.enu_m[2] + sigma[2])
+            archive.add_fix(k, position if known else without_height(position, archive.state(k)))
 
     def _update_scale(self, scatter: float, white: float) -> None:
         """Scatter of the fixes about the path, and its white share, over the reported sigma."""
@@ -399,17 +397,14 @@ class GnssUpdater:
             self.plausible.accepted(self._pair, verdict is GateDecision.REACQUIRE)
         self.skid.accepted(fix.t_ns, innovation[:2], horizontal.copy(), float(own_m2.sum()))
         horizontal += (scale**2 - 1.0) * sigma[:2] ** 2
-        sigma[:2] *= scale
         cut = cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = math.isfinite(innovation[2] + sigma[2])
-        if (
-            not known
-            or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is GateDecision.REJECT
-        ):
-            height = (np.asarray(state.pose.translation()) + at.R @ at.lever_m)[2]
-            sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
-            position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
-        chain.add_fix(k, position if weight == 1.0 else dataclasses.replace(position, weight=weight))
+        if known:
+            gated, _ = self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)
+            known = gated is not GateDecision.REJECT
+        sigma = sigma * np.array([scale, scale, 1.0])
+        position = dataclasses.replace(position, sigma_m=sigma, weight=weight)
+        chain.add_fix(k, position if known else without_height(position, state))
         velocity = self.velocities.factor(chain, fix, at, self.antenna_m, covariance, noise.gnss_inflation)
         if velocity is not None:
             chain.add_velocity(k, velocity)
@@ -445,3 +440,10 @@ class GnssUpdater:
         drift_m2 = (share * self.drift_sigma_m) ** 2
         white = [math.sqrt(max(sigma**2 - drift_m2, self.white * sigma**2)) for sigma in level]
         return np.maximum([*white, up * self._height_factor], LEAST_SIGMA_M)
+
+
+def without_height(fix: GnssPosition, state: KeyState) -> GnssPosition:
+    """A fix whose height is that of the keyframe's `state`, and of no weight."""
+    enu_m = np.append(fix.enu_m[:2], state.place_of(fix.lever_m)[2])
+    sigma = np.append(fix.sigma_m[:2], UNKNOWN_HEIGHT_SIGMA_M)
+    return dataclasses.replace(fix, enu_m=enu_m, sigma_m=sigma)

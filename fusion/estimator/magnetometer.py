@@ -210,7 +210,7 @@ class MagnetometerAiding(BiasedSensor[Array]):
         measurements of this keyframe; `corrections` counts the heading corrections by GNSS. The newest IMU
         sample is at `newest_ns`.
         """
-        R = chain.state(chain.last).pose.rotation().matrix()
+        R = chain.state(chain.last).rotation
         jacobian = yaw_jacobian(R)
         before_rad2, after_rad2 = (
             float(jacobian @ P[POSE, POSE][:3, :3] @ jacobian) for P in (before, after)

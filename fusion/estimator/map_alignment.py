@@ -70,8 +70,7 @@ def align_to_map(
     if fit is None:
         return None
     chain.smooth(len(chain.nodes))
-    pose = chain.state(chain.last).pose
-    antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ antenna_m
+    antenna = chain.state(chain.last).place_of(antenna_m)
     there = fit.at(track.antenna())
     known = bool(np.isfinite(fix.enu_m[2] + fix.sigma_m[2]))
     to_m = np.array([there.real, there.imag, fix.enu_m[2] if known else antenna[2]])
@@ -107,8 +106,7 @@ def turn_window(
     it moves and by the fix, sigma times `scale`.
     """
     chain.smooth(len(chain.nodes))
-    pose = chain.state(k).pose
-    antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ antenna_m
+    antenna = chain.state(k).place_of(antenna_m)
     off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
     doubt[3:6] = off**2 + (fix.horizontal_sigma_m * scale) ** 2
     chain.restart(doubt, chain.first)

@@ -76,7 +76,6 @@ class Propagator:
         self._state, self._until_ns = state, state.t_ns
         self._key = key = key_state_of(state)
         self._from = gtsam.NavState(key.pose, key.velocity)
-        self._R = key.pose.rotation().matrix()
         self._covariance, self._count, self._readings = covariance, 0, np.zeros((2, 3))
         self._measured = self._preintegrator.integrate([], key.bias, noise)
 
@@ -85,9 +84,8 @@ class Propagator:
         seconds = max(measured.deltaTij(), 1e-9)
         now = measured.predict(self._from, self._key.bias_seen(*(self._readings / seconds)))
         R, velocity = now.attitude().matrix(), np.asarray(now.velocity())
-        F, G = transition(
-            self._R, R, measured.deltaPij(), measured.deltaVij(), measured.deltaTij(), len(self._covariance)
-        )
+        moved = measured.deltaPij(), measured.deltaVij(), measured.deltaTij()
+        F, G = transition(self._key.rotation, R, *moved, len(self._covariance))
         P = F @ self._covariance @ F.T
         P[NAV, NAV] += G @ measured.preintMeasCov() @ G.T
         return dataclasses.replace(

@@ -61,7 +61,7 @@ class MotionMonitor:
 
     def __init__(self, rig: Rig) -> None:
         # Mean of two counts a side, each up to one quantum off at either end of a window.
-        self.quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
+        self.quantum_m = rig.quantum_m
         # Both ends of a window are read off a line between samples: while the speed changes by 1 m/s2.
         self._stamp_m = 0.5 * 1.0 / rig.sensors.wheels.rate_hz**2
         self.slipping = False

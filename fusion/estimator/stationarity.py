@@ -88,11 +88,9 @@ class StationarityDetector:
     """
 
     def __init__(self, rig: Rig) -> None:
-        wheels = rig.sensors.wheels
-        quantum_m = wheels.quantum_rad * rig.wheel_radius_m
-        needed = 2.5 * quantum_m / CREEP_MPS + 1.0 / wheels.rate_hz
+        needed = 2.5 * rig.quantum_m / CREEP_MPS + 1.0 / rig.sensors.wheels.rate_hz
         self.window_s = min(max(needed, SHORTEST_S), LONGEST_S)
-        self.still_m = max(1.001 * quantum_m, PARKED_MPS * self.window_s)
+        self.still_m = max(1.001 * rig.quantum_m, PARKED_MPS * self.window_s)
         self._imu_spec = rig.sensors.imu
 
     def is_stationary(

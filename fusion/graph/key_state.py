@@ -70,6 +70,10 @@ class KeyState:
         """Rotation (3, 3) body to world."""
         return np.asarray(self.pose.rotation().matrix())
 
+    def place_of(self, body_m: Array) -> Array:
+        """Place (3,) in the world of a point of the body, m."""
+        return np.asarray(self.pose.translation() + self.rotation @ body_m)
+
     @property
     def slip(self) -> float:
         """Longitudinal slip."""

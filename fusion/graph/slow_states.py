@@ -124,8 +124,7 @@ def inflate_slip_covariance(
     share = 1.0 - (1.0 - min(switch, MOST_SWITCH)) ** (1.0 / max(len(passed), 1))
     for k in passed:
         node = chain.nodes[k - chain.first]
-        up = node.point.pose.rotation().matrix()[2]
-        anew = step(dt_s, noise, up, drift_sigma_m, drift_time_s, share, node.wheels)
+        anew = step(dt_s, noise, node.point.rotation[2], drift_sigma_m, drift_time_s, share, node.wheels)
         chain.revise(k, anew if node.markov is None else node.markov.inflated(anew, GROUND_STATES))
 
 
