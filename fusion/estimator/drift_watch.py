@@ -50,7 +50,7 @@ TELLING = 0.1
 
 
 @dataclass(frozen=True)
-class Drift:
+class DriftEstimate:
     """An estimate of the drift; `variance_m2`: mean of both axes."""
 
     t_ns: int
@@ -74,15 +74,15 @@ class DriftWatch:
     sigma_m: float
     time_s: float
     fresh: bool = False
-    seen: list[Drift] = field(default_factory=list)
+    seen: list[DriftEstimate] = field(default_factory=list)
     sheet_m: float = field(init=False)
-    _reference: Drift | None = None
+    _reference: DriftEstimate | None = None
     _moves: float = 0.0
 
     def __post_init__(self) -> None:
         self.sheet_m = self.sigma_m
 
-    def _move(self, before: Drift, now: Drift) -> tuple[tuple[float, float], float, float]:
+    def _move(self, before: DriftEstimate, now: DriftEstimate) -> tuple[tuple[float, float], float, float]:
         """A move east and north, m, the variance of it that a consistent filter has, and that of the drift
         itself, m2 an axis.
         """
@@ -91,7 +91,7 @@ class DriftWatch:
         moved_m = now.east_m - kept * before.east_m, now.north_m - kept * before.north_m
         return moved_m, kept**2 * before.variance_m2 + new_m2 - now.variance_m2, new_m2
 
-    def learn(self, now: Drift, least_m: float) -> None:
+    def learn(self, now: DriftEstimate, least_m: float) -> None:
         """Follow the moves of the drift, with sigma between `least_m` and the data sheet's."""
         if self._reference is not None:
             if now.t_ns - self._reference.t_ns < LEARNED_S * 1e9:
@@ -114,7 +114,7 @@ class DriftWatch:
             return
         P = chain.covariance_at(chain.last)
         east_m, north_m = chain.state(chain.last).of(DRIFT).tolist()
-        now = Drift(chain.nodes[-1].t_ns, east_m, north_m, 0.5 * float(np.trace(P[DRIFT, DRIFT])))
+        now = DriftEstimate(chain.nodes[-1].t_ns, east_m, north_m, 0.5 * float(np.trace(P[DRIFT, DRIFT])))
         self.learn(now, least_m)
         moved = self.moved_too_far(now)
         if moved is None or P[2, 2] > MOST_YAW_RAD**2:
@@ -123,7 +123,7 @@ class DriftWatch:
         if skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
             self.restart()
 
-    def moved_too_far(self, now: Drift) -> tuple[int, Array] | None:
+    def moved_too_far(self, now: DriftEstimate) -> tuple[int, Array] | None:
         """Take an estimate in; since when and how far, (2,) m, it moved faster than a receiver drifts.
 
         None where it did not.

@@ -87,7 +87,7 @@ UNKNOWN = np.full(3, np.nan)
 class Estimator:
     """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
 
-    Samples may come late and out of order (see `ordered_samples`); keyframes are made as soon as the IMU
+    Samples may come late and out of order (see `sample_stream`); keyframes are made as soon as the IMU
     and the wheels (or their waiting time) cover them. `on_state` is called with every new `State`,
     `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
     """

@@ -4,7 +4,7 @@ import bisect
 import math
 
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.inputs.ordered_samples import OrderedSamples
+from terrafusion.fusion.inputs.sample_stream import SampleStream
 from terrafusion.fusion.inputs.time_jumps import Newest
 from terrafusion.fusion.inputs.validation import as_number, checked_time
 
@@ -12,7 +12,7 @@ LONGEST_HOLD_S = 1.0
 """An angle holds for so long, or for three intervals of slower samples."""
 
 
-class SteeringStream(OrderedSamples):
+class SteeringStream(SampleStream):
     """Steering angles over time, as the curvature (tan front - tan rear) / wheelbase of the bicycle model.
 
     The point that follows the wheels (`Rig.ahead_m`) moves (tan front + tan rear) / 2 to the left per metre

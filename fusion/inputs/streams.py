@@ -12,7 +12,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
-from terrafusion.fusion.inputs.ordered_samples import OrderedSamples
+from terrafusion.fusion.inputs.sample_stream import SampleStream
 from terrafusion.fusion.inputs.time_jumps import Newest, median_step_ns
 from terrafusion.fusion.inputs.validation import (
     MOST_MPS,
@@ -77,7 +77,7 @@ def is_gap(seconds: float, times: list[int]) -> bool:
     return seconds > USUAL_GAP_S and seconds > longest_gap_s(times)
 
 
-class ImuStream(OrderedSamples):
+class ImuStream(SampleStream):
     """IMU samples; the sample at t stands for the time since the one before it.
 
     Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
@@ -226,7 +226,7 @@ def turned(vectors: Array, angle_rad: float) -> Array:
     return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
-class WheelStream(OrderedSamples):
+class WheelStream(SampleStream):
     """Travelled distance of the left and right side over time.
 
     Samples with a speed or travel that no robot has are left out; `impossible` counts them. Over a jump of

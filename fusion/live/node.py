@@ -34,7 +34,7 @@ from terrafusion.datasets.readers.ros.static_frames import STATIC, StaticFrames
 from terrafusion.fusion.estimate.estimate import STATUS, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.inputs.ordered_samples import MOST_LATE_S
+from terrafusion.fusion.inputs.sample_stream import MOST_LATE_S
 from terrafusion.fusion.inputs.time_jumps import (
     CONFIRMED,
     CONFIRMED_NS,

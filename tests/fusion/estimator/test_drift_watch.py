@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.estimator.drift_watch import Drift, DriftWatch
+from terrafusion.fusion.estimator.drift_watch import DriftEstimate, DriftWatch
 from terrafusion.fusion.replay import ReplayResult, replay
 from tests.studies.opponents.drives import Drive, drives_of, longest
 
@@ -44,7 +44,7 @@ def alarms(rng: np.random.Generator, slide_m: float) -> int:
     (east, variance), (north, _) = filtered(fixes[0]), filtered(fixes[1])
     watch = DriftWatch(SIGMA_M, TIME_S)
     rows = zip(east, north, variance, strict=True)
-    found = [watch.moved_too_far(Drift(k * 10**9, x, y, v)) for k, (x, y, v) in enumerate(rows)]
+    found = [watch.moved_too_far(DriftEstimate(k * 10**9, x, y, v)) for k, (x, y, v) in enumerate(rows)]
     return sum(one is not None for one in found)
 
 
@@ -72,7 +72,7 @@ def learned_m(rng: np.random.Generator, true_m: float, seconds: int = 300) -> fl
         gain = P @ h / (h @ P @ h + 0.2**2)
         left = off + drift + 0.2 * rng.normal(size=2) - x @ h
         x, P = x + np.outer(left, gain), P - np.outer(gain, h @ P)
-        watch.learn(Drift(k * 10**9, *x[:, 1].tolist(), P[1, 1]), LEAST_M)
+        watch.learn(DriftEstimate(k * 10**9, *x[:, 1].tolist(), P[1, 1]), LEAST_M)
     return watch.sigma_m
 
 
@@ -91,10 +91,10 @@ def test_drift_is_never_less_than_reported() -> None:
 
 def test_a_new_drift_state_is_not_compared_with_the_old_one() -> None:
     watch = DriftWatch(SIGMA_M, TIME_S)
-    assert watch.moved_too_far(Drift(0, 0.0, 0.0, 1.0)) is None
+    assert watch.moved_too_far(DriftEstimate(0, 0.0, 0.0, 1.0)) is None
     watch.restart()
-    assert watch.moved_too_far(Drift(10**9, 9.0, 0.0, 1.0)) is None
-    assert watch.moved_too_far(Drift(2 * 10**9, 0.0, 0.0, 1.0)) is not None
+    assert watch.moved_too_far(DriftEstimate(10**9, 9.0, 0.0, 1.0)) is None
+    assert watch.moved_too_far(DriftEstimate(2 * 10**9, 0.0, 0.0, 1.0)) is not None
 
 
 def replayed(drive: Drive, monkeypatch: pytest.MonkeyPatch, watched: bool) -> ReplayResult:

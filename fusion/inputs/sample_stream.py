@@ -68,7 +68,7 @@ class Lateness:
         return bisect.bisect_right(times, t_ns)
 
 
-class OrderedSamples:
+class SampleStream:
     """Samples in the order of their times, in lists: the times and, in each other one of `COLUMNS`, values.
 
     Attributes:
