@@ -26,6 +26,7 @@ from terrafusion.fusion.graph.variables import insert, retracted, state_of
 
 BLOCK = 500
 """Keyframes whose rows are held at a time."""
+MOST_STEPS = 30
 
 
 class BatchSmoother:
@@ -55,14 +56,14 @@ class BatchSmoother:
         self._conditionals = np.zeros((self.size - 1, self.dim, 2 * self.dim + 1))
         self._root = np.zeros((self.dim, self.dim + 1))
 
-    def optimise(self, iterations: int = 30, tolerance: float = 0.1) -> int:
+    def optimise(self, tolerance: float = 0.1) -> int:
         """Gauss-Newton with step halving; returns the iterations taken.
 
         It ends with the first step shorter than `tolerance`, in sigmas of the whole solution (the root of
         the decrease of the sum of squares).
         """
         error = self.linearise()
-        for taken in range(1, iterations + 1):
+        for taken in range(1, MOST_STEPS + 1):
             step = self._solve()
             length = self._step_length()
             scale = 1.0
@@ -79,7 +80,7 @@ class BatchSmoother:
                 self.linearise()
                 return taken
             self.values, self.linear, error = values, linear, trial
-        return iterations
+        return MOST_STEPS
 
     def states(self) -> list[KeyState]:
         """The states of all keyframes."""

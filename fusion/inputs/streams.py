@@ -58,6 +58,8 @@ sensor)."""
 GAP_INTERVALS, SLOWEST_INTERVAL_S = 2.5, 2.0
 """A slow stream has a gap where samples are missing by its own interval, of at most 2 s."""
 INTERVALS_SEEN = 21
+HALF_NS = 50_000_000
+"""Half of the time over which a speed is taken."""
 JUMP_M = 5.0
 """A counter that moves by this much more than a wheel of the fastest robot can has jumped (assumed)."""
 
@@ -349,13 +351,13 @@ class WheelStream(SampleStream):
         right = self.right_m[j - 1] + w * (self.right_m[j] - self.right_m[j - 1])
         return left, right
 
-    def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
+    def speed_change_mps(self, start_ns: int, end_ns: int) -> float:
         """Speed of both sides at the end less that at the start, m/s; 0 where samples are missing.
 
         Each speed is a mean about its time; where the newest sample cuts the last one short, the change is
         that of a steady acceleration between the two middles.
         """
-        half, newest = over_ns // 2, self.t_ns[-1] if self.t_ns else 0
+        half, newest = HALF_NS, self.t_ns[-1] if self.t_ns else 0
         if newest <= end_ns - half:
             return 0.0
         windows = [(t - half, min(t + half, newest)) for t in (start_ns, end_ns)]
