@@ -1,4 +1,4 @@
-/* Fixed Runge-Kutta steps around the generated right-hand side, for TF_RUNS runs at a time.
+/* Fixed-step Runge-Kutta around the generated right-hand side, for TF_RUNS runs at a time.
  *
  * Inputs are linear between samples. Each wheel has its own soil: at the coordinate
  * c = time_weight * t + travel_weight * (travel + its distance ahead of the body origin) the
@@ -139,9 +139,9 @@ static void tf_slope(tf_runs *runs, double t, const tf_real *x, const tf_real *u
   tf_each(x, u, runs->vehicle, runs->effects, runs->soil, runs->held, runs->local, dx);
 }
 
-/* Where the stages of a step lie ahead of its start, and which input they take. */
-static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0};
-static const int tf_stage_input[4] = {0, 1, 1, 2};
+/* Where the stages of a step lie ahead of its start, and which input they take: RK4, and RK3 with three of them. */
+static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0}, tf_third_at[3] = {0.0, 0.5, 1.0};
+static const int tf_stage_input[4] = {0, 1, 1, 2}, tf_third_input[3] = {0, 1, 2};
 
 /* What a step adds to a state. In 32 bits thousands of small steps would round the same way: what is lost is
  * kept and added with the next (Kahan 1965, Further remarks on reducing truncation errors). */
@@ -156,43 +156,25 @@ static inline void tf_add(tf_runs *runs, tf_real *x, int i, tf_real step) {
 #endif
 }
 
-/* A step of the classical method of fourth order. */
-static void tf_step(tf_runs *runs, double t, tf_number h, tf_real *x, tf_real u[3][TF_NU]) {
+/* A step of the classical method of fourth order, or of Kutta's of third (1901). */
+static void tf_step(tf_runs *runs, double t, tf_number h, long order, tf_real *x, tf_real u[3][TF_NU]) {
   tf_real k[4][TF_NX], y[TF_NX];
-  const tf_number two = 2, sixth = h / 6;
+  const double *at = order == 3 ? tf_third_at : tf_stage_at;
+  const tf_number two = 2, four = 4, sixth = h / 6;
+  const int *input = order == 3 ? tf_third_input : tf_stage_input;
   if (runs->changing) tf_fields(runs, x);
-  for (int stage = 0; stage < 4; ++stage) {
-    const tf_number ahead = (tf_number)tf_stage_at[stage] * h;
-    if (stage)
+  for (int stage = 0; stage < order; ++stage) {
+    const tf_number ahead = (tf_number)at[stage] * h;
+    if (stage == 2 && order == 3)
+      for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + h * (two * k[1][i] - k[0][i]);
+    else if (stage)
       for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[stage - 1][i];
-    tf_slope(runs, t + ahead, stage ? y : x, u[tf_stage_input[stage]], k[stage]);
+    tf_slope(runs, t + ahead, stage ? y : x, u[input[stage]], k[stage]);
   }
-  for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, sixth * (k[0][i] + two * k[1][i] + two * k[2][i] + k[3][i]));
-}
-
-/* A Runge-Kutta-Chebyshev step with the coefficients (stages, 5) of chebyshev.py. */
-static void tf_chebyshev_step(tf_runs *runs, double t, double h, long stages, const double *c, tf_real *x,
-                              tf_real u[3][TF_NU]) {
-  tf_real first[TF_NX], slope[TF_NX], y[TF_NX], v[TF_NU], d[3][TF_NX];
-  tf_real *before = d[0], *now = d[1], *next = d[2];
-  if (runs->changing) tf_fields(runs, x);
-  tf_slope(runs, t, x, u[0], first);
-  for (int i = 0; i < TF_NX; ++i) {
-    now[i] = (tf_number)(h * c[2]) * first[i];
-    before[i] = now[i] - now[i];
-  }
-  for (long j = 1; j < stages; ++j) {
-    const double at = c[4];
-    c += 5;
-    const tf_number mu = (tf_number)c[0], nu = (tf_number)c[1], own = (tf_number)(h * c[2]), start = (tf_number)(h * c[3]);
-    for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + now[i];
-    for (int i = 0; i < TF_NU; ++i) v[i] = u[0][i] + (tf_number)at * (u[2][i] - u[0][i]);
-    tf_slope(runs, t + at * h, y, v, slope);
-    for (int i = 0; i < TF_NX; ++i) next[i] = mu * now[i] + nu * before[i] + own * slope[i] + start * first[i];
-    tf_real *free = before;
-    before = now, now = next, next = free;
-  }
-  for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, now[i]);
+  if (order == 3)
+    for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, sixth * (k[0][i] + four * k[1][i] + k[2][i]));
+  else
+    for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, sixth * (k[0][i] + two * k[1][i] + two * k[2][i] + k[3][i]));
 }
 
 /* Inputs at the start, middle and end of step j of `substeps` after a sample. */
@@ -260,24 +242,19 @@ static void tf_through(tf_runs *runs, tf_real *x) {
 }
 
 /* Samples x(t0 + i dt), i = 0..n, of TF_RUNS runs; every `every`-th into outs[run] ((n / every + 1, TF_NX)),
- * whose first row holds x(t0) on entry. A sample takes so many RK4 steps; or, where `stages` is not 0,
- * Runge-Kutta-Chebyshev steps of so many with these coefficients. Two lanes may name the same run. */
-TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long steps, long stages, const double *coefficients,
-                           long every, double t0, double dt, const double *const *inputs, double *const *outs) {
+ * whose first row holds x(t0) on entry, by Runge-Kutta steps of `order` 4 or 3. Two lanes may name the same run. */
+TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps, long order, long every, double t0,
+                           double dt, const double *const *inputs, double *const *outs) {
   tf_runs runs;
   tf_real x[TF_NX], u[3][TF_NU];
-  const double h = dt / (double)steps;
+  const double h = dt / (double)substeps;
   TF_WITHOUT_SUBNORMALS
   for (int k = 0; k < TF_RUNS; ++k) tf_take(&runs, x, k, outs[k]);
   tf_runs_start(&runs, plants, t0, x);
   for (long i = 0; i < n; ++i) {
-    for (long j = 0; j < steps; ++j) {
-      const double t = t0 + (double)i * dt + (double)j * h;
-      tf_inputs(inputs, i, j, steps, u);
-      if (stages)
-        tf_chebyshev_step(&runs, t, h, stages, coefficients, x, u);
-      else
-        tf_step(&runs, t, (tf_number)h, x, u);
+    for (long j = 0; j < substeps; ++j) {
+      tf_inputs(inputs, i, j, substeps, u);
+      tf_step(&runs, t0 + (double)i * dt + (double)j * h, (tf_number)h, order, x, u);
     }
     tf_through(&runs, x);
     if ((i + 1) % every == 0)

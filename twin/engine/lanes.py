@@ -33,7 +33,7 @@ def integrate_many(
     substeps: int | None = None,
     every: int = 1,
     jobs: int = 1,
-    stages: int = 0,
+    order: int = 4,
     short: bool = False,
 ) -> Array:
     """States (B, N // every + 1, X) of B runs; see `integrate.integrate`.
@@ -47,15 +47,14 @@ def integrate_many(
         plants: B vehicles, grounds and optional effects.
         t0_s: time of the first sample.
         backend: "c", "vm", or "auto" (C where a compiler is found).
-        substeps: steps a sample; by default each run's own `steps_a_sample` of RK4.
+        substeps: RK4 steps a sample; by default each run's own `steps_a_sample`.
         every: only every so many-th sample is returned, from the first on.
         jobs: threads (compiled code runs outside Python's global lock).
-        stages: of Runge-Kutta-Chebyshev steps, of second order, in place of RK4 steps (see
-            `stability.stable_stages`); 0: RK4.
+        order: of the Runge-Kutta steps, 4 or 3 (a quarter less work).
         short: numbers of 32 bits, twice as many runs at once (compiled code only).
 
     Raises:
-        ValueError: an array is misshapen.
+        ValueError: an array is misshapen, or there is no such order.
     """
     count = len(plants)
     inputs = np.ascontiguousarray(inputs, dtype=float)
@@ -65,7 +64,7 @@ def integrate_many(
         raise ValueError(f"inputs {inputs.shape} are misshapen for {count} runs")
     out = np.empty((count, (shape[0] - 1) // every + 1, len(STATES)))
     out[:, 0] = x0
-    fleet = Fleet.of(plants, dt_s, backend, substeps, stages, short)
+    fleet = Fleet.of(plants, dt_s, backend, substeps, order, short)
     fleet.drive([inputs] * count if shared else list(inputs), list(out), t0_s, every, jobs)
     blank_what_diverged(out)
     return out
@@ -77,7 +76,6 @@ class _Task(NamedTuple):
     native: Driver | None
     held: list[CPlant]
     steps: int
-    stages: int
     runs: list[int]
 
 
@@ -88,6 +86,7 @@ class Fleet:
     plants: Sequence[Plant]
     dt_s: float
     tasks: list[_Task]
+    order: int
 
     @classmethod
     def of(
@@ -95,19 +94,25 @@ class Fleet:
         plants: Sequence[Plant],
         dt_s: float,
         backend: str = "auto",
-        substeps: int | None = None,
-        stages: Sequence[int] | int = 0,
+        substeps: Sequence[int] | int | None = None,
+        order: int = 4,
         short: bool = False,
     ) -> Self:
         """Groups plants that share graph and step, as many as a driver has lanes; arguments as those of
-        `integrate_many`, `stages` also by plant."""
-        alike: dict[tuple[tuple[str, ...], bool, int, int], list[int]] = defaultdict(list)
+        `integrate_many`, `substeps` also by plant.
+
+        Raises:
+            ValueError: `order`, that of the Runge-Kutta steps, is not 3 or 4.
+        """
+        if order not in (3, 4):
+            raise ValueError(f"there is no step of order {order}: 3 and 4 are known")
+        alike: dict[tuple[tuple[str, ...], bool, int], list[int]] = defaultdict(list)
         for i, plant in enumerate(plants):
-            own = stages[i] if isinstance(stages, Sequence) else stages
-            steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
-            alike[plant.effect_names(), plant.route.is_fixed(), steps, own].append(i)
+            own = substeps[i] if isinstance(substeps, Sequence) else substeps
+            steps = own if own is not None else steps_a_sample(dt_s, plant.vehicle)
+            alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
         tasks: list[_Task] = []
-        for (effects, fixed, steps, own), runs in alike.items():
+        for (effects, fixed, steps), runs in alike.items():
             kind = LANES_32 if short else LANES if len(runs) > 1 else SINGLE
             native = chosen(backend, Variant(kind, effects, fixed))
             lanes = 1 if native is None else native.lanes
@@ -115,8 +120,8 @@ class Fleet:
                 some = runs[first : first + lanes]
                 some = some + some[-1:] * (lanes - len(some))
                 held = [] if native is None else native.held([plants[i] for i in some])
-                tasks.append(_Task(native, held, steps, own, some))
-        return cls(plants, dt_s, tasks)
+                tasks.append(_Task(native, held, steps, some))
+        return cls(plants, dt_s, tasks, order)
 
     def drive(
         self, inputs: Sequence[Array], outs: Sequence[Array], t0_s: float = 0.0, every: int = 1, jobs: int = 1
@@ -130,10 +135,10 @@ class Fleet:
             some = [inputs[i] for i in task.runs]
             if task.native is not None:
                 own = [outs[i] for i in task.runs]
-                task.native.run(task.held, some, own, self.dt_s, t0_s, task.steps, every, task.stages)
+                task.native.run(task.held, some, own, self.dt_s, t0_s, task.steps, every, self.order)
                 return
             for i, u in zip(task.runs, some, strict=True):
-                states = vm.run(outs[i][0], u, self.dt_s, self.plants[i], t0_s, task.steps, task.stages)
+                states = vm.run(outs[i][0], u, self.dt_s, self.plants[i], t0_s, task.steps, self.order)
                 outs[i][:] = states[::every]
 
         if jobs > 1 and all(task.native is not None for task in self.tasks):

@@ -10,7 +10,6 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import codegen, compiler, library_cache
-from terrafusion.twin.engine.chebyshev import coefficients
 from terrafusion.twin.engine.codegen import Variant
 from terrafusion.twin.model.plant import Plant
 
@@ -65,8 +64,8 @@ class Driver:
         self._simulate = library.tf_simulate
         self._simulate.restype = None
         self._simulate.argtypes = [
-            ctypes.c_void_p, *[ctypes.c_long] * 3, ctypes.c_void_p, ctypes.c_long, ctypes.c_double,
-            ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p,
+            ctypes.c_void_p, *[ctypes.c_long] * 4, ctypes.c_double, ctypes.c_double, ctypes.c_void_p,
+            ctypes.c_void_p,
         ]  # fmt: skip
         if variant.kind == codegen.TANGENT:
             self._simulate_wide = library.tf_simulate_wide
@@ -89,17 +88,16 @@ class Driver:
         t0_s: float,
         steps: int,
         every: int = 1,
-        stages: int = 0,
+        order: int = 4,
     ) -> None:
         """Fill each of `outs` (N // every + 1, X), whose first row holds the start, by its inputs (N + 1, U).
 
-        All arrays are contiguous; there are as many of each as the driver has lanes. A sample takes `steps`
-        RK4 steps, or Runge-Kutta-Chebyshev steps of so many stages.
+        All arrays are contiguous; there are as many of each as the driver has lanes. The Runge-Kutta steps
+        are of `order` 4 or 3.
         """
         addresses = (ctypes.c_void_p * self.lanes)(*(ctypes.addressof(h.struct) for h in held))
         self._simulate(
-            addresses, len(inputs[0]) - 1, steps, stages,
-            coefficients(stages).ctypes.data if stages else None, every, t0_s, dt_s,
+            addresses, len(inputs[0]) - 1, steps, order, every, t0_s, dt_s,
             (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in inputs)),
             (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in outs)),
         )  # fmt: skip

@@ -1,13 +1,11 @@
 """The twin in CasADi's virtual machine: where no C compiler is found, and to test the C code against."""
 
 import functools
-import itertools
 from typing import Any
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.twin.engine.chebyshev import coefficients
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.plant import Plant, SoilField, smoothstep
 from terrafusion.twin.physics.layout import (
@@ -25,10 +23,10 @@ _ARGUMENTS = ("x", "t", "ua", "ub", "constants", "effects", "at", "table")
 
 
 def run(
-    x0: Array, inputs: Array, dt_s: float, plant: Plant, t0_s: float, steps: int, stages: int = 0
+    x0: Array, inputs: Array, dt_s: float, plant: Plant, t0_s: float, steps: int, order: int = 4
 ) -> Array:
     """States (N + 1, X), as `integrate.integrate` returns them; not finite once they diverge."""
-    one = _sample(len(plant.route.at), steps, plant.effect_names(), _Held(plant.route.field), stages)
+    one = _sample(len(plant.route.at), steps, plant.effect_names(), _Held(plant.route.field), order)
     return _accumulate(one, x0, inputs, dt_s, t0_s, _constants(plant, dt_s, plant.effect_values()))
 
 
@@ -98,8 +96,8 @@ class _Held:
 
 
 @functools.lru_cache(maxsize=16)
-def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held, stages: int) -> Any:
-    """CasADi `Function`: the state one sample later, by steps as those of driver.c."""
+def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held, order: int) -> Any:
+    """CasADi `Function`: the state one sample later, by `steps` Runge-Kutta steps (see driver.c)."""
     import casadi as ca
 
     f = rhs(effects)
@@ -122,15 +120,11 @@ def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held, stage
         u = [ua + (j + 0.5 * m) / steps * (ub - ua) for m in range(3)]
         vary = _field(held.field, x, vehicle)
         k1 = slope(t, x, u[0], vary)
-        if stages:
-            c = coefficients(stages)
-            before, now = ca.MX(nx, 1), h * c[0, 2] * k1
-            for (*_, share), (mu, nu, own, start, _) in itertools.pairwise(c.tolist()):
-                k = slope(t + share * h, x + now, u[0] + share * (u[2] - u[0]), vary)
-                before, now = now, mu * now + nu * before + h * (own * k + start * k1)
-            x = x + now
-            continue
         k2 = slope(t + 0.5 * h, x + 0.5 * h * k1, u[1], vary)
+        if order == 3:
+            k3 = slope(t + h, x + h * (2.0 * k2 - k1), u[2], vary)
+            x = x + h / 6.0 * (k1 + 4.0 * k2 + k3)
+            continue
         k3 = slope(t + 0.5 * h, x + 0.5 * h * k2, u[1], vary)
         k4 = slope(t + h, x + h * k3, u[2], vary)
         x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
@@ -142,7 +136,7 @@ def _sample_with_tangents(knots: int, steps: int, effects: tuple[str, ...], held
     """CasADi `Function`: state and tangents (X (1 + M),) one sample later."""
     import casadi as ca
 
-    one = _sample(knots, steps, effects, held, 0)
+    one = _sample(knots, steps, effects, held, 4)
     forward = one.forward(count)
     nx = len(STATES)
     z = ca.MX.sym("z", nx * (1 + count))

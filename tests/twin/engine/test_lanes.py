@@ -71,13 +71,13 @@ def test_a_run_has_the_same_bits_alone_and_among_others(jobs) -> None:
 
 
 @needs_compiler
-@pytest.mark.parametrize("stages", [0, 4])
-def test_in_32_bits_a_run_has_the_same_bits_alone_and_among_others(stages: int) -> None:
+@pytest.mark.parametrize("order", [3, 4])
+def test_in_32_bits_a_run_has_the_same_bits_alone_and_among_others(order: int) -> None:
     some = plants()
     inputs, x0 = commands(len(some)), starts(len(some))
-    together = integrate_many(x0, inputs, DT_S, some, stages=stages, short=True)
+    together = integrate_many(x0, inputs, DT_S, some, order=order, short=True)
     for k, plant in enumerate(some):
-        alone = integrate_many(x0[k : k + 1], inputs[k], DT_S, [plant], stages=stages, short=True)
+        alone = integrate_many(x0[k : k + 1], inputs[k], DT_S, [plant], order=order, short=True)
         np.testing.assert_array_equal(together[k], alone[0], err_msg=str(k))
 
 
@@ -158,34 +158,32 @@ def test_backends_agree_with_every_effect_in_the_graph() -> None:
 
 
 @needs_compiler
-def test_backends_agree_on_chebyshev_steps() -> None:
+def test_backends_agree_on_steps_of_third_order() -> None:
     some = plants()
     inputs, x0 = commands(len(some)), starts(len(some))
-    c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b, stages=4) for b in ("c", "vm"))
+    c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b, order=3) for b in ("c", "vm"))
     assert (np.abs(c - vm) / (np.abs(vm).max(axis=1, keepdims=True) + 1e-6)).max() < 1e-9
     assert not np.array_equal(c, integrate_many(x0, inputs, DT_S, some))
 
 
 @needs_compiler
-@pytest.mark.parametrize(("stages", "least"), [(4, 3.5), (0, 12.0)])
-def test_the_error_falls_as_the_order_of_the_steps_says(stages: int, least: float) -> None:
-    """On a smooth command; halving the step takes away three quarters of it, or fifteen sixteenths."""
-
+@pytest.mark.parametrize(("order", "least"), [(3, 6.5), (4, 12.0)])
+def test_the_error_falls_as_the_order_of_the_steps_says(order: int, least: float) -> None:
+    """On a smooth command; halving the step takes away seven eighths of it, or fifteen sixteenths."""
     t = np.arange(201) * DT_S
     side = 2.0 + np.sin(2.0 * t)
     inputs = delayed_inputs(np.stack([side, 1.2 * side], axis=1), DT_S)
-    plant = plants()[:1]
-    x0 = integrate_many(np.zeros(len(STATES)), inputs, DT_S, plant, substeps=32)[0, 100]
-
-    def end(factor: int) -> np.ndarray:
-        at = np.linspace(1.0, 2.0, 100 * factor + 1)
-        finer = np.stack([np.interp(at, t, column) for column in inputs.T], axis=1)
-        return integrate_many(x0, finer, DT_S / factor, plant, substeps=4, stages=stages)[0, -1]
-
-    ends = [end(factor) for factor in (1, 2, 16)]
+    x0, plant = np.zeros(len(STATES)), plants()[:1]
+    x0 = integrate_many(x0, inputs, DT_S, plant, substeps=32)[0, 100]
+    ends = [integrate_many(x0, inputs[100:], DT_S, plant, substeps=n, order=order)[0, -1] for n in (4, 8, 64)]
     at = [INDEX["x"], INDEX["y"], INDEX["yaw"]]
-    coarse, fine = (np.linalg.norm((one - ends[2])[at]) for one in ends[:2])
+    coarse, fine = (np.linalg.norm((end - ends[2])[at]) for end in ends[:2])
     assert coarse > least * fine
+
+
+def test_there_is_no_other_order() -> None:
+    with pytest.raises(ValueError, match="order 2"):
+        integrate_many(starts(1), commands(1), DT_S, plants()[:1], order=2)
 
 
 @needs_compiler

@@ -14,7 +14,6 @@ from terrafusion.twin.calibrate.predict import predict
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.engine.lanes import Fleet
 from terrafusion.twin.gap.answer.verdict import null_probability
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, SMALLEST, Candidates
 from terrafusion.twin.gap.data.logs import prepared
@@ -136,40 +135,25 @@ def test_sets_of_effects_batch_are_what_each_is_alone(log_and_model, monkeypatch
     np.testing.assert_allclose(together[7][rate] - heavy[rate], 0.01, rtol=1e-9)
 
 
-class FineFleet:
-    """Plants driven by RK4 steps."""
-
-    @staticmethod
-    def of(plants, dt_s, **_) -> Fleet:
-        return Fleet.of(plants, dt_s, substeps=24)
-
-
-def test_integration_and_numbers_of_32_bits_lose_little_of_what_sensors_tell(
-    log_and_model, monkeypatch
-) -> None:
-    """Beside RK4 steps of .4 ms, in units of the sensors' noise, with effects of each kind."""
+def test_numbers_of_32_bits_lose_less_than_steps_of_third_order(log_and_model, monkeypatch) -> None:
+    """In units of the sensors' noise, with effects of each kind."""
     log, model = log_and_model
     keys = ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "backlash/lost_motion")
     keys += ("slope/uniform",)
     asks = [Rollout(log, {})]
     asks += [Rollout(log, {k: 0.3 * float(CANDIDATES.scale[CANDIDATES.keys.index(k)])}) for k in keys]
-
-    def told() -> np.ndarray:
+    told = {}
+    for short, order in ((True, 3), (False, 3), (False, 4)):
+        monkeypatch.setattr(batch, "SINGLE_PRECISION", short)
+        monkeypatch.setattr(batch, "INTEGRATOR_ORDER", order)
         found = predictions(asks, model, CANDIDATES)
-        return np.array(
+        told[short, order] = np.array(
             [np.concatenate([y / o.sigma for o, y in zip(log.observed, ys, strict=True)]) for ys in found]
         )
-
-    usual = told()
-    monkeypatch.setattr(batch, "SINGLE_PRECISION", False)
-    long = told()
-    monkeypatch.setattr(batch, "Fleet", FineFleet)
-    fine = told()
-    assert 0.0 < np.abs(usual - long).max() < 0.02
-    lost = long - fine
-    assert np.sqrt(np.square(lost).mean(axis=1)).max() < 0.01
-    of_effects, signatures = lost[1:] - lost[0], fine[1:] - fine[0]
-    assert (np.square(of_effects).sum(axis=1) < 0.01**2 * np.square(signatures).sum(axis=1)).all()
+    by_bits = told[True, 3] - told[False, 3]
+    by_order = told[False, 4] - told[False, 3]
+    assert 0.0 < np.abs(by_bits).max() < 0.02
+    assert np.square(by_bits).sum() < np.square(by_order).sum()
 
 
 def test_runs_of_several_logs_are_what_each_is_alone(log_and_model) -> None:

@@ -15,13 +15,15 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.coordinates import Coordinate
+from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
-from terrafusion.twin.engine.stability import fastest_rate
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.rollout.batch import INTEGRATOR_ORDER
 from terrafusion.twin.gap.rollout.residuals import (
     LinearisationCache,
     RunResiduals,
@@ -49,9 +51,9 @@ EFFECT_SIGMA = 0.1
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
 STEPS, TRIES, ENOUGH = 6, 4, 0.01
 """Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
-MOST_RATE = 910.0
-"""1/s: fastest rate at rest up to which harder ground and stiffer motors than the given twin's are tried:
-logs hardly tell stiffer ones apart, all rollouts would take longer, and fewer changes were detected."""
+MOST_STEPS = 4
+"""Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not
+tried: logs hardly tell them from softer ones, and all rollouts would take longer."""
 DAMPING, LESS, MORE = 1.0, 1.0 / 6.0, 8.0
 """First damping, as a share of the information, and its factors after a step that is better, or is not."""
 
@@ -91,12 +93,16 @@ class _Fit:
             {c.name: c.value(float(x)) for c, x in zip(self.numbers, w, strict=True)}
         )
 
+    def steps(self, model: Model) -> int:
+        """Integration steps a sample that a twin needs."""
+        return stable_steps(DT_S, plant_of(self.runs[0].log, model), INTEGRATOR_ORDER)
+
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or is too
-        stiff."""
+        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or needs too
+        many steps."""
         models, count = [self.model(w) for w in points], len(self.runs)
-        given, *rates = (fastest_rate(plant_of(self.runs[0].log, m)) for m in (self.cache.model, *models))
-        soft = [rate <= max(MOST_RATE, given) for rate in rates]
+        most = max(MOST_STEPS, self.steps(self.cache.model))
+        soft = [self.steps(model) <= most for model in models]
         tried = [Rollout(r.log, {}, model=m) for m in itertools.compress(models, soft) for r in self.runs]
         found = iter(aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs))
         out = list[list[Array] | None]()

@@ -23,7 +23,7 @@ from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
 from terrafusion.twin.engine.native import driver
 from terrafusion.twin.engine.reader import reader
-from terrafusion.twin.engine.stability import stable_stages
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import Indices
 from terrafusion.twin.model.measurement import measured
@@ -43,8 +43,7 @@ NOMINAL = ""  # stands for the twin without a further effect, in the first group
 INTEGRATOR_ORDER = 3
 """On loose sand, the most sensitive case, results differ from fourth order by no more than those from half
 the step do (docs/how-to/gap.md)."""
-STEPS = 2  # Runge-Kutta-Chebyshev steps a sample: one is not exact enough for stiff motors
-SINGLE_PRECISION = True  # rounding of 32-bit numbers is below the integration error (tested)
+SINGLE_PRECISION = True  # rounding of 32-bit numbers is below the integration error (docs/how-to/gap.md)
 FULL_GRAPH_COST = 1.8
 """Time of a run in the graph of all effects over that in the graph of one group (measured)."""
 ABSENT_SHARE = 1e-12
@@ -107,13 +106,13 @@ def motion_effects(candidates: Candidates, effects: Effects) -> MotionEffects:
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """One run: its log, plant, inputs (N + 1, U), poses (W, 3) at the windows' starts, and stages a step."""
+    """One run: its log, plant, inputs (N + 1, U), poses (W, 3) at the windows' starts, and steps a sample."""
 
     log: PreparedLog
     plant: Plant
     inputs: Array
     start: Array
-    stages: int
+    steps: int
 
 
 def make_lanes(
@@ -126,12 +125,12 @@ def make_lanes(
     scales = dict(zip(candidates.keys, candidates.scale, strict=True))
     dead_time = VEHICLE_PARAMETERS.index("dead_time_applied_s")
     bases, inputs, out = dict[tuple[int, int], Plant](), dict[tuple[int, float], Array](), list[Lane]()
-    stages = dict[tuple[int, int], int]()
+    steps = dict[tuple[int, int], int]()
     for log, model, effects, start in runs:
         if (id(log), id(model)) not in bases:
             others = other_effects(model, candidates)
             bases[id(log), id(model)] = plant_of(log, dataclasses.replace(model, effects=others))
-            stages[id(log), id(model)] = stable_stages(DT_S / STEPS, plant_of(log, model))
+            steps[id(log), id(model)] = stable_steps(DT_S, plant_of(log, model), INTEGRATOR_ORDER)
         base = bases[id(log), id(model)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
@@ -141,7 +140,7 @@ def make_lanes(
         if (id(log), delay_s) not in inputs:
             inputs[id(log), delay_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, delay_s))
         plant = Plant(vehicle, base.route, {**base.effects, **present})
-        out.append(Lane(log, plant, inputs[id(log), delay_s], start, stages[id(log), id(model)]))
+        out.append(Lane(log, plant, inputs[id(log), delay_s], start, steps[id(log), id(model)]))
     return out
 
 
@@ -179,8 +178,8 @@ def simulate_lanes(lanes: Sequence[Lane]) -> list[Array]:
 
 
 def _fleet(lanes: Sequence[Lane]) -> Fleet:
-    plants, stages = [lane.plant for lane in lanes], [lane.stages for lane in lanes]
-    return Fleet.of(plants, DT_S, substeps=STEPS, stages=stages, short=SINGLE_PRECISION)
+    plants, steps = [lane.plant for lane in lanes], [lane.steps for lane in lanes]
+    return Fleet.of(plants, DT_S, substeps=steps, order=INTEGRATOR_ORDER, short=SINGLE_PRECISION)
 
 
 def _initial_states(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
