@@ -40,8 +40,11 @@ COMMENTS = {
     "gnss_delay_s": "s; lateness of the stamps of the fixes",
     "wheel_delay_s": "s; lateness of the stamps of the wheels",
     "course_lag_s": "s; by which the course follows the heading",
+    "imu_roll_rad": "rad; angle of the IMU about x",
+    "imu_pitch_rad": "rad; angle of the IMU about y",
     "imu_yaw_rad": "rad; angle of the IMU about z, to the left",
 }
+"""Of every number that `calibrate_sensors` may find."""
 
 
 @dataclass(frozen=True, eq=False)

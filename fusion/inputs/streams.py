@@ -188,7 +188,7 @@ class ImuStream(SampleStream):
             gyro, accel = gyro @ self.level.T, accel @ self.level.T
         if self.turn_scale:
             gyro = gyro * np.array([1.0, 1.0, 1.0 + self.turn_scale])
-        if self.mounting_rad:
+        if self.mounting_rad and self.six_axis:  # about z: the yaw rate alone stays as it is
             gyro, accel = turned(gyro, self.mounting_rad), turned(accel, self.mounting_rad)
         return gyro, accel
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.fusion.init.draft import write_draft
 from terrafusion.fusion.init.level import FORWARD_SIGMA_RAD, forward_line, measure_tilt, tilt_lines
+from terrafusion.fusion.init.vehicle import COMMENTS
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -86,3 +87,7 @@ def test_acceleration_shows_that_the_imu_is_not_turned_by_a_quarter(drive: Recor
         drive.imu, gyro_radps=drive.imu.gyro_radps @ R, accel_mps2=drive.imu.accel_mps2 @ R
     )
     assert not forward_line(dataclasses.replace(drive, imu=imu), BASE.rig())
+
+
+def test_every_number_that_a_calibration_finds_has_its_comment_in_the_file() -> None:
+    assert COMMENTS.keys() == SensorNumbers.__dataclass_fields__.keys()

@@ -1,12 +1,13 @@
-"""Wheel speed changes between keyframes."""
+"""Samples between keyframes."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 
 STEP_NS = 20_000_000
 
@@ -32,3 +33,12 @@ def test_without_samples_no_change_is_told() -> None:
     assert WheelStream().speed_change_mps(900_000_000, 1_000_000_000) == 0.0
     assert stream(1.0, 0.9).speed_change_mps(900_000_000, 1_000_000_000) == 0.0
     assert stream(1.0, 2.0).speed_change_mps(0, 100_000_000) == 0.0
+
+
+def test_a_gyro_of_one_axis_may_be_mounted_at_any_angle() -> None:
+    imu = ImuStream(six_axis=False)
+    imu.mounting_rad = 1.5
+    for i in range(10):
+        imu.add(i * STEP_NS, [np.nan, np.nan, 0.3], [np.nan] * 3)
+    rates, _ = imu.levelled(0, 9 * STEP_NS)
+    np.testing.assert_array_equal(rates, np.tile([0.0, 0.0, 0.3], (9, 1)))
