@@ -38,8 +38,8 @@ TWIN = (
     Study(
         "unseen_gap",
         "Does the diagnosis see and name changes of robots that no part of the library made?",
-        module("unseen_gap.study", "--out", OUT, "--first-seed", "114"),
-        12,
+        module("unseen_gap.study", "--out", OUT, "--first-seed", "112", "--robots", "4"),
+        25,
         {
             "alarms": r"false alarms, same drives: (\d+ of \d+)",
             "alarms_other": r"false alarms, other drives: (\d+ of \d+)",
