@@ -56,7 +56,7 @@ SIGNIFICANT_Z = 3.0
 IN_A_ROW = 5
 """Fixes beyond the gate one after the other from which on they are no outliers but contradict: the chance of
 it, at a gate of 99.9 %, is 1e-15 for independent errors."""
-FAR_BELOW = 0.3  # innovations over their sigma below which an assumed sigma may be far too large
+FAR_BELOW = 0.3  # innovations over their sigma below which a sigma that no fix reports may be far too large
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
 CLEARLY_WORSE, CLEARLY_M, FAR_WORSE, FAR_WORSE_M = 1.5, 0.1, 2.0, 0.5
@@ -351,8 +351,8 @@ def _supports(run: Run) -> Iterator[str]:
         )
         if np.mean(used) ** 0.5 < FAR_BELOW and any(NO_SIGMA in note for note in run.recording.notes):
             yield (
-                f"the fixes report no sigma, and {_fix_sigma_m(run.used):g} m was assumed: if the receiver "
-                "is better, give its `gnss_sigma_m` in the vehicle file"
+                f"the fixes report no sigma, and {_fix_sigma_m(run.used):g} m is taken for it: if the "
+                "receiver is better, give its `gnss_sigma_m` in the vehicle file"
             )
 
 

@@ -318,7 +318,7 @@ def listed_overrides(overrides: Overrides) -> str:
 def _in_words(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_in_words, value))}]"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
