@@ -22,13 +22,14 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
+from terrafusion.twin.gap.data.samples import with_observed
 from terrafusion.twin.gap.infer.law_misfit import GROUND
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import marginalise_robot_offsets, marginalise_run_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
-from terrafusion.twin.gap.rollout.sensitivities import Course, channel_sensitivities, linearise_all
+from terrafusion.twin.gap.rollout.sensitivities import Course, channel_sensitivities, linearise_all, turned
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.file import scenario_of
@@ -162,7 +163,9 @@ def forecast_runs(evidence: GapEvidence, names: Sequence[str], effects: set[str]
     for name, own, run in zip(names, courses, linearise_all(courses, candidates), strict=True):
         if run is not None:
             found = channel_sensitivities(own.log, run)
-            residuals = residuals_from(own.log, found, own.model, candidates, evidence.channels)
+            pairs = zip(own.log.observed, found, strict=True)
+            log = with_observed(own.log, [dataclasses.replace(o, value=s.value) for o, s in pairs])
+            residuals = residuals_from(log, turned(log, found), own.model, candidates, evidence.channels)
             out[name] = whitened(residuals, evidence.noise)
     return out
 

@@ -23,7 +23,7 @@ from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, residuals_from, whitened
-from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to
+from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise, moved_to, turned
 from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
 from terrafusion.twin.model.vehicle import VehicleParams
 
@@ -59,7 +59,7 @@ class _Fit:
         effects = dict(zip(self.keys, (x * self.scale).tolist(), strict=True))
         model = dataclasses.replace(self.model, effects={**self.model.effects, **effects})
         run = linearise(log, model, self.candidates, log.start, None if derivatives else ())
-        found = channel_sensitivities(log, run)
+        found = turned(log, channel_sensitivities(log, run))
         found = moved_to(log, found, log.start, aligned_start(log, [s.value for s in found], log.start))
         raw = residuals_from(log, found, model, self.candidates, self.channels)
         return whitened(raw.without_nuisance(), self.noise)

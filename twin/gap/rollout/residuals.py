@@ -23,6 +23,7 @@ from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.data.samples import Indices, by_channel, sample_map, with_observed
+from terrafusion.twin.gap.rollout.measured_turns import with_heading_errors
 from terrafusion.twin.gap.rollout.nuisance import nuisance_columns
 from terrafusion.twin.gap.rollout.sensitivities import (
     Linearisation,
@@ -30,6 +31,7 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     channel_sensitivities,
     linearise,
     moved_to,
+    turned,
 )
 from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise, with_shared, without_shared
 from terrafusion.twin.model.vectors import soil_vector
@@ -239,10 +241,10 @@ def run_residuals(log: PreparedLog, cache: LinearisationCache, channels: Sequenc
         TerrafusionError: the twin diverges.
     """
     shared = cache.of(log)
-    found = moved_to(log, channel_sensitivities(log, shared), shared.start, log.start)
+    found = moved_to(log, turned(log, channel_sensitivities(log, shared)), shared.start, log.start)
     start, before = aligned_start(log, [s.value for s in found], log.start), log.start
     if cache.candidates.any_world_fixed(cache.model.effects):  # the run does not turn as a whole
-        found = channel_sensitivities(log, linearise(log, cache.model, cache.candidates, start))
+        found = turned(log, channel_sensitivities(log, linearise(log, cache.model, cache.candidates, start)))
         start, before = aligned_start(log, [s.value for s in found], start), start
     return residuals_from(log, moved_to(log, found, before, start), cache.model, cache.candidates, channels)
 
@@ -254,12 +256,14 @@ def residuals_from(
     candidates: Candidates,
     channels: Sequence[str],
 ) -> RunResiduals:
-    """Errors and derivatives of a run, from its sensitivities."""
+    """Errors and derivatives of a run, from its sensitivities, turned as measured."""
     soil, log = soil_columns(candidates), with_timing(log, [s.value for s in found])
     error, columns, by_patch, K = [], [], [], len(candidates.keys)
-    for observed, s in zip(log.observed, found, strict=True):
+    values = [s.value for s in found]
+    pairs = zip(log.observed, values, strict=True)
+    states = with_heading_errors(log, values, [_sensor_states(o.channel, y, model.vehicle) for o, y in pairs])
+    for observed, s, sensors in zip(log.observed, found, states, strict=True):
         by_pose, by_effect, patches = np.split(s.columns, [3, 3 + K], axis=1)
-        sensors = _sensor_states(observed.channel, s.value, model.vehicle)
         nuisance = nuisance_columns(log, model, observed, s.heading, channels)
         error.append(observed.value - s.value)
         columns.append(np.hstack([by_pose, by_effect[:, soil], sensors, by_effect, nuisance]))

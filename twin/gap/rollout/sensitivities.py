@@ -36,6 +36,7 @@ from terrafusion.twin.gap.rollout.batch import (
 )
 from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.ground_patches import patch_columns
+from terrafusion.twin.gap.rollout.measured_turns import as_measured, turned_apart, with_heading_errors
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
 from terrafusion.twin.sensors.effects import without_delays
 
@@ -91,24 +92,33 @@ class Rollout:
 def aligned_predictions(
     rollouts: Sequence[Rollout], model: Model, candidates: Candidates, jobs: int = 1
 ) -> list[list[Array] | None]:
-    """As `predictions`, with the track of each window aligned with the observed one.
+    """As `predictions`, with the track of each window turned as the gyro measured and aligned with the
+    observed one.
 
     World-fixed effects are simulated again from the aligned poses: a robot that slides down a slope does not
     point along its track.
     """
-    done, out = list(rollouts), predictions(rollouts, model, candidates, jobs)
+    done, out = list(rollouts), _turned_predictions(rollouts, model, candidates, jobs)
     again = list[int]()
     for i, (rollout, y) in enumerate(zip(rollouts, out, strict=True)):
         own = (rollout.model or model).effects
         if y is not None and candidates.any_world_fixed({**own, **rollout.effects}):
             done[i] = dataclasses.replace(rollout, start=aligned_start(rollout.log, y, rollout.poses()))
             again.append(i)
-    for i, y in zip(again, predictions([done[i] for i in again], model, candidates, jobs), strict=True):
+    new = _turned_predictions([done[i] for i in again], model, candidates, jobs)
+    for i, y in zip(again, new, strict=True):
         out[i] = y
     return [
         None if y is None else moved(r.log, y, r.poses(), aligned_start(r.log, y, r.poses()))
         for r, y in zip(done, out, strict=True)
     ]
+
+
+def _turned_predictions(
+    rollouts: Sequence[Rollout], model: Model, candidates: Candidates, jobs: int
+) -> list[list[Array] | None]:
+    found = zip(rollouts, predictions(rollouts, model, candidates, jobs), strict=True)
+    return [None if y is None else as_measured(r.log, y, y) for r, y in found]
 
 
 def predictions(
@@ -271,6 +281,17 @@ def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitiv
         columns = weighted_means(coarse, _channel(run.columns, observed.channel))
         out.append(Sensitivity(value, columns, run.heading[coarse[0][:, 2]]))
     return out
+
+
+def turned(log: PreparedLog, channels: Sequence[Sensitivity]) -> list[Sensitivity]:
+    """Sensitivities with the tracks turned as the gyro measured, see `measured_turns`."""
+    values = [s.value for s in channels]
+    new = as_measured(log, values, values)
+    columns = with_heading_errors(log, new, as_measured(log, values, [s.columns for s in channels]))
+    return [
+        Sensitivity(new[i], columns[i], s.heading + turned_apart(log, values, i))
+        for i, s in enumerate(channels)
+    ]
 
 
 def moved_to(log: PreparedLog, channels: Sequence[Sensitivity], old: Array, new: Array) -> list[Sensitivity]:
