@@ -18,6 +18,7 @@ from terrafusion.fusion.estimator.alignment import KnownStart
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE, DriftWatch
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
+from terrafusion.fusion.estimator.fix_prediction import PredictedFix, without_height
 from terrafusion.fusion.estimator.fix_velocity import FixVelocities
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map, turn_window
@@ -25,18 +26,16 @@ from terrafusion.fusion.estimator.place_doubt import OpenHeading, rounded
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
-from terrafusion.fusion.graph.key_state import BIAS, DRIFT, NAV, POSE, SLIP, VELOCITY, KeyState
+from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import BIAS, DRIFT, SLIP, VELOCITY
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
-from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
+from terrafusion.fusion.weighting.weighting import Weighting
 
 LEAST_SIGMA_M = 0.005
 KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 """Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
-UNKNOWN_HEIGHT_SIGMA_M = 1e6
-"""1 sigma of an unknown height: even many such fixes must not determine it."""
 OUTAGE_S = 2.0
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
@@ -215,7 +214,7 @@ class GnssUpdater:
                 if restarted or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                 used |= self._add_fix(chain, k, fix, noise)
-                if self._pair is None or self._pair.usable:
+                if self._within_reach:
                     self._unchecked = fix
         self.drift_watch.fresh = used and self._share >= LEAST_SHARE
         if used:
@@ -245,16 +244,16 @@ class GnssUpdater:
         east_m, north_m, _ = chain.state(k).place_of(self.antenna_m).tolist()
         return complex(east_m, north_m)
 
-    def _gated(self, chain: Chain, k: int, innovation_m: Array, S: Array) -> tuple[GateDecision, float]:
+    def _gated(self, chain: Chain, predicted: PredictedFix) -> tuple[GateDecision, float]:
         """Verdict of the gate and of plausibility on the newest fix, and the normalised square."""
-        verdict, nis = self.gate.test(innovation_m, S)
+        verdict, nis = self.gate.test(predicted.innovation_m[:2], predicted.S_m2)
         if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
             return GateDecision.ACCEPT, nis
         if verdict is GateDecision.ACCEPT or self._pair is None:
             return verdict, nis
-        if self.plausible.rejected(self._pair, self._antenna(chain, k), self.track, self.scale):
+        if self.plausible.rejected(self._pair, self._antenna(chain, predicted.k), self.track, self.scale):
             return GateDecision.REACQUIRE, nis
-        return (verdict if self._pair.usable else GateDecision.REJECT), nis
+        return (verdict if self._within_reach else GateDecision.REJECT), nis
 
     def _align(self, chain: Chain, fix: GnssFix, noise: SensorNoise) -> bool:
         """Align a path that was begun without fixes with the map; True once they determine how."""
@@ -287,11 +286,8 @@ class GnssUpdater:
 
     def _doubt_used(self, chain: Chain, fix: GnssFix) -> None:
         """Doubt what fixes of a far too small sigma have made of the window, once their scatter is known."""
-        first, ratio, self._applied_scale = (
-            self._applied_scale == 1.0,
-            self.scale / self._applied_scale,
-            self.scale,
-        )
+        first, ratio = self._applied_scale == 1.0, self.scale / self._applied_scale
+        self._applied_scale = self.scale
         for k, node in enumerate(chain.nodes, chain.first):
             for old in node.fixes[:]:
                 wider = old.sigma_m * np.array([ratio, ratio, 1.0])
@@ -348,79 +344,66 @@ class GnssUpdater:
         self.turned += 1
         return True
 
-    def _add_fix(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise, again: bool = False) -> bool:
-        state, at = chain.state(k), AntennaMotion.of(chain, k, fix, self.antenna_m)
-        covariance = chain.covariance_at(k)
-        inflation = noise.gnss_inflation * self.scale
-        share = self._share = self._drift_share(fix, inflation)
-        # The fix is carried to its keyframe by the speed as it is known now.
-        east, north = VELOCITY.start, VELOCITY.start + 1
-        carried_m = abs(at.offset_s) * math.sqrt(0.5 * (covariance[east, east] + covariance[north, north]))
-        sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
-        position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps, delay_s=at.delay_s)
-        left, H_pose, H_linear = linearised(position, state)
-        innovation, J = -left, np.zeros((3, chain.dim))
-        J[:, POSE], J[:, NAV.stop :] = H_pose, H_linear[:, : chain.dim - NAV.stop]
-        P = J @ covariance @ J.T
-        horizontal = np.einsum("ii->i", P[:2, :2])  # a view
-        predicted_m2 = horizontal.copy()
-        # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
-        own_m2 = np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
-        horizontal += own_m2
-        verdict, nis = self._gated(chain, k, innovation[:2], P[:2, :2])
-        may_skid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
-        if may_skid and not again and self._test_wheels(chain, k, fix, noise):
-            return self._add_fix(chain, k, fix, noise, again=True)
-        scale, weight = 1.0, 1.0
+    def _add_fix(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
+        """Test a fix at keyframe k, once more if it refutes the wheels, and use it; False when rejected."""
+        predicted = self._predicted(chain, k, fix, noise)
+        verdict, nis = self._gated(chain, predicted)
+        refuted = verdict is GateDecision.REJECT and self._refutes_wheels(chain, k, fix, noise)
+        if refuted:
+            predicted = self._predicted(chain, k, fix, noise)
+            verdict, nis = self._gated(chain, predicted)
+        used, weighted = verdict is not GateDecision.REJECT, predicted
         if verdict is not GateDecision.REACQUIRE:
-            drift_m2 = (share * self.drift_sigma_m) ** 2
-            scale, weight = self.weighting.gnss(
-                InnovationTest(
-                    fix.t_ns,
-                    innovation[:2],
-                    predicted_m2,
-                    sigma[:2] ** 2,
-                    fix.sigma_m[:2] * self.scale,
-                    drift_m2,
-                    self.white,
-                )
-            )
-        used = verdict is not GateDecision.REJECT
-        why = "" if self._pair is None or self._pair.usable else BEYOND
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, used, "" if used else why))
-        if verdict is GateDecision.REJECT:
-            if again:
+            test = predicted.innovation_test(self.scale, self.drift_sigma_m, self.white)
+            weighted = predicted.weighted(*self.weighting.gnss(test))
+        why = "" if used or self._within_reach else BEYOND
+        self._report(Innovation(fix.t_ns, "gnss", predicted.innovation_m, nis, 2, used, why))
+        if not used:
+            if refuted:
                 self.skid.undo(chain)
             self.rejected += 1
             return False
         if self._pair is not None:
             self.plausible.accepted(self._pair, verdict is GateDecision.REACQUIRE)
-        self.skid.accepted(fix.t_ns, innovation[:2], horizontal.copy(), float(own_m2.sum()))
-        horizontal += (scale**2 - 1.0) * sigma[:2] ** 2
-        cut = cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
-        known = math.isfinite(innovation[2] + sigma[2])
+        own_m2 = float(predicted.own_m2.sum())
+        self.skid.accepted(fix.t_ns, predicted.innovation_m[:2], predicted.S_m2.diagonal(), own_m2)
+        self._add_factors(chain, weighted, verdict, noise.gnss_inflation)
+        return True
+
+    def _predicted(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> PredictedFix:
+        inflation = noise.gnss_inflation * self.scale
+        share = self._share = self._drift_share(fix, inflation)
+        white_m = self._white_sigma(fix, inflation, share)
+        return PredictedFix.of(chain, k, fix, self.antenna_m, white_m, share, fix.sigma_m * inflation)
+
+    def _add_factors(self, chain: Chain, used: PredictedFix, verdict: GateDecision, inflation: float) -> None:
+        """Position, with its height where its gate accepts it, and velocity of a fix."""
+        k, fix, position, off_m, P = used.k, used.fix, used.position, used.innovation_m, used.covariance
+        cut = cut_past(chain, k, P, off_m[:2], used.S_m2, used.jacobian[:2], verdict)
+        known = math.isfinite(off_m[2] + position.sigma_m[2])
         if known:
-            gated, _ = self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)
+            gated, _ = self.height_gate.test(off_m[2:], used.predicted_m2[2:, 2:] + position.sigma_m[2] ** 2)
             known = gated is not GateDecision.REJECT
-        sigma = sigma * np.array([scale, scale, 1.0])
-        position = dataclasses.replace(position, sigma_m=sigma, weight=weight)
-        chain.add_fix(k, position if known else without_height(position, state))
-        velocity = self.velocities.factor(chain, fix, at, self.antenna_m, covariance, noise.gnss_inflation)
+        chain.add_fix(k, position if known else without_height(position, used.state))
+        velocity = self.velocities.factor(chain, fix, used.motion, self.antenna_m, P, inflation)
         if velocity is not None:
             chain.add_velocity(k, velocity)
         if cut:
             chain.smooth(chain.last - k + 1)
             chain.restart(np.zeros(chain.dim), k)
-        if weight > UNUSED_WEIGHT:
+        if position.weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
-        return True
 
-    def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
+    @property
+    def _within_reach(self) -> bool:
+        """Whether the robot can have driven to the newest fix."""
+        return self._pair is None or self._pair.usable
+
+    def _refutes_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""
-        refused = [off for off, _ in self.gate.rejected]
-        sigma_m = fix.horizontal_sigma_m
-        if not self.track.smooth_at(fix.t_ns):
+        if not (self._within_reach and self.track.smooth_at(fix.t_ns)):
             return False
+        refused, sigma_m = [off for off, _ in self.gate.rejected], fix.horizontal_sigma_m
         if not self.skid.test_wheels(chain, k, self.last_used_ns, refused, sigma_m, noise):
             return False
         self.gate.rejected.pop()  # it is tested again
@@ -440,10 +423,3 @@ class GnssUpdater:
         drift_m2 = (share * self.drift_sigma_m) ** 2
         white = [math.sqrt(max(sigma**2 - drift_m2, self.white * sigma**2)) for sigma in level]
         return np.maximum([*white, up * self._height_factor], LEAST_SIGMA_M)
-
-
-def without_height(fix: GnssPosition, state: KeyState) -> GnssPosition:
-    """A fix whose height is that of the keyframe's `state`, and of no weight."""
-    enu_m = np.append(fix.enu_m[:2], state.place_of(fix.lever_m)[2])
-    sigma = np.append(fix.sigma_m[:2], UNKNOWN_HEIGHT_SIGMA_M)
-    return dataclasses.replace(fix, enu_m=enu_m, sigma_m=sigma)
