@@ -61,7 +61,7 @@ def bridge(
     sigmas = np.array([0.05, 0.05, 0.0, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
     sigmas[2] += _yaw_sigma(turn_rad, dt_s)
     step = before.pose.between(after.pose)
-    link = _loose_link(k, step, sigmas, np.zeros(3), round(2.0 * math.sqrt(dt_s), 6))
+    link = _loose_link(k, step, sigmas, np.zeros(3), 2.0 * math.sqrt(dt_s))
     return after, link, wheels if wheels is None or turn_rad is None else wheels.without_turn()
 
 
@@ -69,7 +69,7 @@ def pause(k: int, before: KeyState, dt_s: float) -> tuple[KeyState, gtsam.Nonlin
     """State and link after a time without samples: the old place, uncertain by what it may have driven."""
     speed = max(float(np.linalg.norm(before.velocity)), PAUSE_MPS)
     sigmas = np.array([0.1, 0.1, PAUSE_YAW_RAD, *[speed * dt_s] * 2, 0.1 * speed * dt_s])
-    link = _loose_link(k, gtsam.Pose3(), sigmas, -before.velocity, round(speed, 3))
+    link = _loose_link(k, gtsam.Pose3(), sigmas, -before.velocity, speed)
     return KeyState(before.pose, np.zeros(3), before.bias, before.linear), link
 
 
