@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.calibration.motion import Complex
 
 WINDOW_S, BLOCK = 1.0, 10
@@ -52,6 +53,14 @@ class Angle:
 
     rad: float
     sigma_rad: float
+
+    @classmethod
+    def of_file(cls, known: KnownNumber | None, unknown_rad: float, least_rad: float) -> Angle:
+        """An angle of a vehicle file: its sigma is at least `least_rad`, without one `unknown_rad`."""
+        if known is None:
+            return cls(0.0, unknown_rad)
+        sigma_rad = known.sigma if isinstance(known.sigma, float) else unknown_rad
+        return cls(known.number, max(sigma_rad, least_rad))
 
     def combined(self, other: Angle) -> Angle:
         """The mean of both by their weights, the short way round."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.fusion.calibration.mounting import Angle
 from terrafusion.fusion.calibration.tilt import LEAST_SIGMA_RAD, MountingTilt
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -58,7 +57,12 @@ class ImuLevel:
         self._accel_sigma_mps2 = spec.accel_bias_sigma_mps2
         self.restart()
         self._six_axis = config.inputs.imu == "six_axis"
-        self.start_from(_priors(config.rig.known))
+        known = config.rig.known
+        roll, pitch = (
+            Angle.of_file(angle, ASSUMED_SIGMA_RAD, LEAST_SIGMA_RAD)
+            for angle in (known.imu_roll_rad, known.imu_pitch_rad)
+        )
+        self.start_from((roll, pitch))
 
     def start_from(self, before: tuple[Angle, Angle]) -> None:
         """Begin with what is known of the robot."""
@@ -191,15 +195,3 @@ def _rotation(level: tuple[Angle, Angle]) -> Array:
     roll, pitch = level
     rotation = level_rotation(roll.rad, pitch.rad)
     return np.eye(3) if rotation is None else rotation
-
-
-def _priors(known: SensorNumbers) -> tuple[Angle, Angle]:
-    roll, pitch = (_prior(number) for number in (known.imu_roll_rad, known.imu_pitch_rad))
-    return roll, pitch
-
-
-def _prior(known: KnownNumber | None) -> Angle:
-    if known is None:
-        return Angle(0.0, ASSUMED_SIGMA_RAD)
-    sigma = known.sigma if isinstance(known.sigma, float) else ASSUMED_SIGMA_RAD
-    return Angle(known.number, max(sigma, LEAST_SIGMA_RAD))

@@ -10,7 +10,6 @@ import math
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, LEAST_SIGMA_RAD, Angle, MountingAngle
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.imu_level import ImuLevel
@@ -42,7 +41,7 @@ class ImuMounting:
         self._bias_sigma = config.rig.sensors.imu.bias_sigma
         self.corrects_since_ns: int | None = None
         self.level = ImuLevel(config, imu)
-        self.start_from(_prior(config.rig.known.imu_yaw_rad))
+        self.start_from(Angle.of_file(config.rig.known.imu_yaw_rad, ANY_ANGLE_RAD, LEAST_SIGMA_RAD))
 
     @property
     def corrects(self) -> bool:
@@ -95,10 +94,3 @@ class ImuMounting:
         doubt[VELOCITY] = DOUBTFUL_MPS**2
         doubt[BIAS] = self._bias_sigma**2 + bias**2
         return doubt
-
-
-def _prior(known: KnownNumber | None) -> Angle:
-    if known is None or known.known == "assumed":
-        return Angle(0.0, ANY_ANGLE_RAD)
-    sigma = known.sigma if isinstance(known.sigma, float) else LEAST_SIGMA_RAD
-    return Angle(known.number, max(sigma, LEAST_SIGMA_RAD))

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.writers import write_log_folder
+from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, Angle
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
@@ -79,6 +81,18 @@ def test_the_file_carries_the_angle_on_and_makes_the_drive_good(run: Recording, 
     assert "refuted" in replay(blind, vehicle="elevate", mode="fixed").verdict.lines()[-1]
     for known in (run, blind):
         assert replay(known, vehicle=file, mode="fixed").verdict.value == "good"
+
+
+@pytest.mark.parametrize(("sigma", "of_yaw", "of_tilt"), [(None, ANY_ANGLE_RAD, 0.1), (0.2, 0.2, 0.2)])
+def test_assumed_angles_are_where_learning_begins(sigma: float | None, of_yaw: float, of_tilt: float) -> None:
+    rig = load_vehicle("elevate").rig()
+    yaw, roll = KnownNumber(1.5, "assumed", sigma), KnownNumber(0.05, "assumed", sigma)
+    known = dataclasses.replace(rig.known, imu_yaw_rad=yaw, imu_roll_rad=roll)
+    estimator = Estimator(EstimatorConfig(dataclasses.replace(rig, known=known), "elevate"))
+    mounting = estimator.learned.mounting
+    assert mounting.known == Angle(1.5, of_yaw)
+    assert mounting.level.known == (Angle(0.05, of_tilt), Angle(0.0, 0.1))
+    assert estimator.imu.mounting_rad == 1.5
 
 
 def test_a_corrected_imu_is_no_reason_for_doubt_and_none_to_refuse(
