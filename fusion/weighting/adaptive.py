@@ -292,11 +292,11 @@ class TerrainNoise:
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
             return
-        p = self._probabilities
+        p, (mean, sigma) = self._probabilities, self._slips
         if self._starts_pooled:
-            mean, sigma = self._slips
-            mean[self._unknown], sigma[self._unknown] = self._ground_slip.mean, self._ground_slip.sigma
-        self.noise = self.policy.blend(self._shares, self._grade, (*self._slips, self._slip_times_s))
+            unknown, own = np.arange(len(mean)) == self._unknown, self._ground_slip
+            mean, sigma = np.where(unknown, own.mean, mean), np.where(unknown, own.sigma, sigma)
+        self.noise = self.policy.blend(self._shares, self._grade, (mean, sigma, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = vars(self._recorded), vars(self.noise)

@@ -108,6 +108,14 @@ def test_learned_slip_survives_a_dump(robot: str) -> None:
     assert restored.noise.slip_mean != Estimator(config).weights.noise.slip_mean
 
 
+def test_noise_of_an_unknown_ground_leaves_the_posterior_as_it_was() -> None:
+    weights = Estimator(EstimatorConfig(as_vehicle("husky").rig(), "husky")).weights
+    before = [values.tolist() for values in weights._slips]
+    weights.learn_slip(0.3, 0.05, 0.3, 0)
+    assert weights.noise.slip_mean == 0.3
+    assert [values.tolist() for values in weights._slips] == before
+
+
 def test_mean_and_spread_are_those_of_two_normals_by_hand() -> None:
     """Two windows of four correlation times, measured as badly as the policy's slip spreads."""
     found, sigma, driven_s = DrivenSlip.of_policy(POLICY), PRIOR_SIGMA[SAND], 8.0 * TIME_S[SAND]
