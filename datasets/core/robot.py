@@ -89,7 +89,7 @@ class Known(Parsed):
             positive = Quantity(self.unit, 1e-9, 1e3, size=2 if pair else 0)
             sigma = positive.parse_part(raw["sigma"], ".sigma")
         elif known == "calibrated" or (known in LENGTH_SIGMA_M and self.unit != "m"):
-            raise RejectedError("'{key}' has no sigma", f"give 1 sigma of what is {known}")
+            raise RejectedError("'{key}' has no sigma", "add sigma, the standard deviation of the value")
         logs = raw.get("logs", [])
         if not isinstance(logs, list) or not all(isinstance(log, str) for log in logs):
             raise RejectedError(f"'{{key}}.logs' is '{shown(logs)}'", "give a list of names")

@@ -108,7 +108,7 @@ robot:
         ("robot.wheel_radius_m", "how is it known"),
         ("robot.track_m.value", "out of range"),
         ("robot.antenna_m.value", "3 numbers"),
-        ("robot.gyro_scale", "has no sigma"),
+        ("robot.gyro_scale", "has no sigma; add sigma, the standard deviation of the value"),
         ("robot.wheel_scale.known", "measured, data_sheet, calibrated, assumed"),
         ("robot.gnss_delay", "write 'gnss_delay_s'"),
     ):
