@@ -31,7 +31,8 @@ def combined(reduced: Sequence[Reduction], now: Knowledge, before: Knowledge) ->
         information = information + shown
         right = right + pull
     covariance = np.linalg.inv(information)
-    found = dataclasses.replace(now, mean=now.mean + covariance @ right, covariance=covariance).outwards()
+    mean, clipped_s = now.mean + covariance @ right, before.clipped_lag_s
+    found = dataclasses.replace(now, mean=mean, covariance=covariance, clipped_lag_s=clipped_s).outwards()
     moments = [one.apply(found.mean - now.mean, found.mean) for one in reduced]
     spread, time_s = slip_process(moments, before.slip_spread, before.slip_time_s)
     misfit = max(one.misfit for one in reduced)

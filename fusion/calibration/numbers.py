@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import erfcx
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.robot import LENGTH_SIGMA_M, KnownNumber, SensorNumbers
@@ -56,7 +57,7 @@ SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
 """Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
 0.3 s, study `course_lag`), and of those that roll (assumed)."""
 NO_LAG_SIGMA_S = 1e-3
-"""1 sigma of a course lag of which the drive shows that there is none."""
+"""1 sigma with which a course lag that cannot be negative is held to 0 while a drive is learned from."""
 IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
@@ -94,6 +95,7 @@ class Knowledge:
         slip_spread: standard deviation of the distance ratio about `wheel_scale`.
         slip_time_s: correlation time of that ratio.
         misfit: variance of the fixes' residuals over that of their white noise; at least 1.
+        clipped_lag_s: root mean square of a course lag that is 0 as it cannot be negative; 0 for any other.
     """
 
     mean: Array
@@ -101,6 +103,7 @@ class Knowledge:
     slip_spread: float
     slip_time_s: float
     misfit: float = 1.0
+    clipped_lag_s: float = 0.0
 
     @functools.cached_property
     def sigma(self) -> Array:
@@ -112,15 +115,21 @@ class Knowledge:
     def outwards(self) -> Knowledge:
         """With a course lag that is not negative: a robot that skids in a turn is carried outwards.
 
-        Where the best one is negative, all numbers are as they are without any.
+        Where the best one is negative, all numbers are as they are without any. What it may be all the same
+        is a normal truncated at 0 (Johnson, Kotz, Balakrishnan 1994, sec. 10.1), here by its second moment.
         """
-        lag_s, covariance = self.mean[COURSE_LAG], self.covariance
+        lag_s, covariance = float(self.mean[COURSE_LAG]), self.covariance
         if lag_s >= 0.0:
             return self
+        sigma_s = float(self.sigma[COURSE_LAG])
+        off = -lag_s / sigma_s
+        square = 1.0 + off**2 - off * math.sqrt(2.0 / math.pi) / float(erfcx(off / math.sqrt(2.0)))
+        clipped_s = max(self.clipped_lag_s, sigma_s * math.sqrt(max(square, 0.0)))
         gain = covariance[:, COURSE_LAG] / covariance[COURSE_LAG, COURSE_LAG]
         without = covariance - np.outer(gain, covariance[COURSE_LAG])
         without[COURSE_LAG, COURSE_LAG] = NO_LAG_SIGMA_S**2
-        return dataclasses.replace(self, mean=self.mean - gain * lag_s, covariance=without)
+        mean = self.mean - gain * lag_s
+        return dataclasses.replace(self, mean=mean, covariance=without, clipped_lag_s=clipped_s)
 
     def given(self, rows: Sequence[int], held: Sequence[int], before: Knowledge) -> tuple[Array, Array]:
         """Mean (n,) and covariance (n, n) of the numbers `rows` if those `held` are as `before`."""
@@ -140,8 +149,9 @@ class Knowledge:
 
         That grows with the `misfit`: what slip leaves of the fixes' residuals is a measure of the rest.
         """
-        imitated = math.sqrt(misfit) * IMITATED
-        return np.asarray(np.minimum(np.hypot(self.sigma, imitated), before.sigma))
+        sigma = np.hypot(self.sigma, math.sqrt(misfit) * IMITATED)
+        sigma[COURSE_LAG] = max(sigma[COURSE_LAG], self.clipped_lag_s)
+        return np.asarray(np.minimum(sigma, before.sigma))
 
 
 def assumed(
@@ -207,4 +217,6 @@ def _rows(known: SensorNumbers, yaw: str) -> dict[int, KnownNumber]:
 
 def for_the_next_run(known: Knowledge, wide: Knowledge, yaw: str) -> Knowledge:
     """What one run gave, as it is known of the next one; no number is known less well than in `wide`."""
-    return known.with_covariance(known.covariance + np.diag(_change_sigma(yaw) ** 2), wide)
+    covariance = known.covariance + np.diag(_change_sigma(yaw) ** 2)
+    covariance[COURSE_LAG, COURSE_LAG] += known.clipped_lag_s**2
+    return dataclasses.replace(known.with_covariance(covariance, wide), clipped_lag_s=0.0)

@@ -11,9 +11,11 @@ import pytest
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
+from terrafusion.fusion.calibration.fit import information_gained
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
+    COURSE_LAG,
     GNSS_DELAY,
     TURN_SCALE,
     WHEEL_SCALE,
@@ -145,6 +147,25 @@ def test_a_log_gives_no_more_than_changes_between_runs_allow() -> None:
     assert after.sigma[ANTENNA_X] == pytest.approx(sure.sigma[ANTENNA_X])
     assert sure.sigma[WHEEL_SCALE] < after.sigma[WHEEL_SCALE] < wide.sigma[WHEEL_SCALE]
     assert (for_the_next_run(wide, wide, "gyro").sigma <= wide.sigma * (1.0 + 1e-9)).all()
+
+
+@pytest.mark.parametrize(("lag_s", "sigma_s"), [(-1e-6, 0.149), (-0.05, 0.08), (-0.2, 0.05)])
+def test_a_course_lag_held_to_zero_is_as_uncertain_as_a_truncated_normal(
+    lag_s: float, sigma_s: float
+) -> None:
+    wide = assumed(1e-3, False, 0.05, 300.0, skids=True)
+    mean, covariance = wide.mean.copy(), wide.covariance.copy()
+    mean[COURSE_LAG], covariance[COURSE_LAG, COURSE_LAG] = lag_s, sigma_s**2
+    held = dataclasses.replace(wide, mean=mean, covariance=covariance).outwards()
+    x = np.linspace(0.0, 1.0, 100_001)
+    density = np.exp(-0.5 * ((x - lag_s) / sigma_s) ** 2)
+    spread_s = np.sqrt((x**2) @ density / density.sum())
+    assert held.mean[COURSE_LAG] == 0.0
+    assert held.stated_sigma(wide)[COURSE_LAG] == pytest.approx(spread_s, rel=1e-3)
+    assert information_gained(wide, held)[COURSE_LAG] == pytest.approx(np.log(0.15 / spread_s), abs=1e-3)
+    later = for_the_next_run(held, wide, "gyro")
+    assert later.sigma[COURSE_LAG] == pytest.approx(min(np.hypot(spread_s, 0.05), 0.15), rel=1e-3)
+    assert later.clipped_lag_s == 0.0
 
 
 def test_the_prior_follows_how_a_number_is_known() -> None:
