@@ -33,6 +33,7 @@ from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import state_fields
+from terrafusion.fusion.estimator.keyframe_motion import KeyframeMotion, MeanMotion, MotionInput
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
@@ -42,30 +43,17 @@ from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
 from terrafusion.fusion.estimator.stationarity import StationarityDetector
-from terrafusion.fusion.estimator.steering import policy_of, steered_turn
+from terrafusion.fusion.estimator.steering import policy_of
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
-from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import imu_gap, slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import imu_factor, mean_rates, wheel_increment
+from terrafusion.fusion.graph.factors import imu_factor
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
-from terrafusion.fusion.graph.planar import (
-    level_factor,
-    with_centripetal_force,
-    with_wheel_acceleration,
-    yaw_of_wheels,
-)
+from terrafusion.fusion.graph.planar import level_factor, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.steering import SteeringStream
-from terrafusion.fusion.inputs.streams import (
-    LONGEST_PAUSE_NS,
-    ImuSegment,
-    ImuStream,
-    WheelStream,
-    is_gap,
-    usual_interval_s,
-)
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, usual_interval_s
 from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
 from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -112,21 +100,22 @@ class Estimator:
         self.imu, self.wheels = ImuStream(not config.inputs.planar, newest), WheelStream(newest)
         self.steering, self.fixes = SteeringStream(rig, newest), EarlyFixes(newest)
         self.gyro, self.weights = StuckGyro(rig, config.inputs), TerrainNoise(config)
-        self._turn = steered_turn(rig, config.inputs)
         self._preintegrator = config.inputs.preintegrator(rig.sensors.imu, rig.drive in SKIDDING)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
-        self._wheel_gate, self._jitter = WheelGate(config.wheel_gate_sigma), WheelJitter()
+        self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._silent, self.wheels_rejected = False, 0
         self._search = StartSearch(config, self.aids, self.gnss)
         self._set_step(config.keyframe_s)
         self._state: State | None = None
-        self._fresh: tuple[State, float, float | None, Array, Array] | None = None  # and the motion to it
+        self._fresh: tuple[State, MeanMotion] | None = None
         self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
         self._place_doubt = PlaceDoubt()
         self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
+        streams = self.imu, self.wheels, self.steering
+        self._motion = MotionInput(config, streams, self._skid, self.learned)
 
     @classmethod
     def for_vehicle(cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive") -> Estimator:
@@ -302,54 +291,52 @@ class Estimator:
         self._keep = round(self.config.lag_s / step_s) + LAG_MARGIN
 
     def _keyframe(self, t_ns: int) -> None:
+        """Append the keyframe at `t_ns`, and use the fixes that it has passed."""
         self._upkeep()
         self.gyro.doubt_heading(self.chain)
-        switch = self.weights.take_switch()
-        before_ns, before = self.chain.nodes[-1].t_ns, self.chain.state(self.chain.last)
-        dt = (t_ns - before_ns) * 1e-9
-        noise, drift = self.weights.noise, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
-        if switch > SWITCHED:
-            slow_states.inflate_slip_covariance(self.chain, t_ns - SEEN_LATE_NS, dt, noise, *drift, switch)
-        segments = self.imu.segments(before_ns, t_ns)
-        if self.config.inputs.planar:
-            segments = with_centripetal_force(segments, before)
-        gap, turn = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns), None
-        if gap and self.config.inputs.sides and self._turn is None:
-            sides_m, track_m = self.wheels.travelled(before_ns, t_ns), self.config.rig.track_m
-            turn, segments = imu_gap.turn_in_gap(before, sides_m, track_m, dt, segments)
-        rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
-        noise = self.learned.with_doubt(noise, t_ns, segments)
-        if self.config.inputs.planar and wheels is not None:
-            segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt)
-        if self._skid.friction is not None:
-            segments, wheels = self._skid.friction.step(
-                t_ns, dt, segments, wheels, before, self.chain.covariance, self._skid.rate_m2ps
-            )
-        k, (gyro, accel) = self.chain.last + 1, mean_rates(segments)
-        link, preintegrated = gtsam.NonlinearFactorGraph(), False
-        if dt > LONGEST_PAUSE_NS * 1e-9:
-            point, link, wheels = *imu_gap.pause(k, before, dt), None
-        elif gap:
-            point, link, wheels = imu_gap.bridge(k, before, wheels, turn, dt)
-        else:
-            measured = self._preintegrator.integrate(segments, before.bias, self.gyro.noise(noise))
-            seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
-            nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
-            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
-            link.add(imu_factor(k, measured))
-            if not self.config.inputs.planar:  # the planar link does not test the wheels
-                preintegrated = True
-                wheels = self._gated(t_ns, wheels, before, point, switch)
-        markov = slow_states.step(dt, noise, before.rotation[2], *drift, switch, wheels)
+        before, switch = self.chain.state(self.chain.last), self._renewed_slip(t_ns)
+        motion = self._motion.up_to(t_ns, self.chain, self.weights.noise)
+        mean, planar = motion.mean, self.config.inputs.planar
+        point, link, wheels = self._linked(t_ns, motion, before, switch)
+        up, drift = before.rotation[2], self.gnss.drift
+        markov = slow_states.step(mean.dt_s, motion.noise, up, *drift, switch, wheels)
         for stream in (self.imu, self.wheels, self.steering):
             stream.late.used_ns = t_ns
-        self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
-        if self.config.inputs.planar:
+        preintegrated = not (planar or motion.in_gap or motion.in_pause)
+        readings = mean.gyro_radps, mean.accel_mps2
+        k = self.chain.append(t_ns, point, link, markov, wheels, *readings, preintegrated)
+        if planar:
             self.chain.add(k, level_factor(k))
         aided = not self.gnss.is_outage(t_ns)
         self._stationarity.update(self.chain, link, self.imu, self.wheels, before, aided)
-        rolled_m = rolled.distance_m if rolled else None
-        self._fresh = self._finish_keyframe(t_ns, gyro, rolled_m), dt, None if gap else rolled_m, gyro, accel
+        self._fresh = self._finish_keyframe(t_ns, mean.gyro_radps, motion.rolled_m), mean
+
+    def _renewed_slip(self, t_ns: int) -> float:
+        """Share of the ground that changed before a keyframe at `t_ns`; the slip of the window follows it."""
+        switch, dt_s = self.weights.take_switch(), (t_ns - self.chain.nodes[-1].t_ns) * 1e-9
+        if switch > SWITCHED:
+            since_ns, noise = t_ns - SEEN_LATE_NS, self.weights.noise
+            slow_states.inflate_slip_covariance(self.chain, since_ns, dt_s, noise, *self.gnss.drift, switch)
+        return switch
+
+    def _linked(
+        self, t_ns: int, motion: KeyframeMotion, before: KeyState, switch: float
+    ) -> tuple[KeyState, gtsam.NonlinearFactorGraph, WheelIncrement | None]:
+        """First state of a keyframe at `t_ns`, the link to it, and the wheels as far as they are believed."""
+        k, mean, wheels, config = self.chain.last + 1, motion.mean, motion.wheels, self.config
+        if motion.in_pause:
+            return *imu_gap.pause(k, before, mean.dt_s), None
+        if motion.in_gap:
+            return imu_gap.bridge(k, before, wheels, motion.turn_rad, mean.dt_s)
+        measured = self._preintegrator.integrate(motion.segments, before.bias, self.gyro.noise(motion.noise))
+        seen = before.bias_seen(mean.gyro_radps, mean.accel_mps2) if config.calibrate else before.bias
+        nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
+        point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
+        link = gtsam.NonlinearFactorGraph()
+        link.add(imu_factor(k, measured))
+        if not config.inputs.planar:  # the planar link does not test the wheels
+            wheels = self._gated(t_ns, wheels, before, point, switch)
+        return point, link, wheels
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> State:
         chain = self.chain
@@ -376,8 +363,8 @@ class Estimator:
         fresh, self._fresh = self._fresh, None
         if fresh is None:
             return
-        state, dt, rolled_m, gyro, accel = fresh
-        self.learned.keyframe(self.chain, dt, rolled_m, gyro, accel)
+        state, mean = fresh
+        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, mean.gyro_radps, mean.accel_mps2)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)
@@ -387,23 +374,6 @@ class Estimator:
             self.chain.smooth(SMOOTH_WINDOW)
         self.weights.update(state, self.imu, self.wheels, self._skid.friction)
         self.learned.advance(self.chain)
-
-    def _wheel_increment(
-        self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState
-    ) -> WheelIncrement | None:
-        travelled = self.wheels.travelled(before_ns, t_ns)
-        if travelled is None:
-            return None
-        rig, inputs, bias_z = self.config.rig, self.config.inputs, float(before.bias.gyroscope()[2])
-        increment = wheel_increment(
-            travelled, segments, bias_z, rig.track_m, rig.quantum_m, self.weights.noise,
-            self.wheels.speed_change_mps(before_ns, t_ns), self.config.calibrate, self.learned.course_lag_s(),
-        )  # fmt: skip
-        increment = self._jitter.applied(increment)
-        increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
-        if self._turn is not None:
-            return self._turn.between(before_ns, t_ns, increment, self.steering, self.chain.covariance)
-        return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
         self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, switch: float

@@ -124,6 +124,11 @@ class GnssUpdater:
         """1 sigma of the slow errors, each axis."""
         return self.drift_watch.sigma_m
 
+    @property
+    def drift(self) -> tuple[float, float]:
+        """1 sigma, m, and correlation time, s, of the slow errors."""
+        return self.drift_watch.sigma_m, self.drift_time_s
+
     def queue(self, fix: GnssFix) -> None:
         """Take a fix in, in any order of time."""
         if self.delay_s:

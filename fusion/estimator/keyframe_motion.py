@@ -1,0 +1,117 @@
+"""What IMU and wheels measured from one keyframe to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
+from terrafusion.fusion.estimator.skid import SkidDetector
+from terrafusion.fusion.estimator.steering import steered_turn
+from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.factors import mean_rates, wheel_increment
+from terrafusion.fusion.graph.imu_gap import turn_in_gap
+from terrafusion.fusion.graph.planar import with_centripetal_force, with_wheel_acceleration
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.steering import SteeringStream
+from terrafusion.fusion.inputs.streams import LONGEST_PAUSE_NS, ImuSegment, ImuStream, WheelStream, is_gap
+from terrafusion.fusion.noise.policy import SensorNoise
+
+
+@dataclass(frozen=True, eq=False)
+class MeanMotion:
+    """Motion over `dt_s` up to a keyframe.
+
+    Attributes:
+        rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
+        gyro_radps, accel_mps2: (3,) mean readings, corrected.
+    """
+
+    dt_s: float
+    rolled_m: float | None
+    gyro_radps: Array
+    accel_mps2: Array
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMotion:
+    """Motion up to a keyframe as its link takes it.
+
+    Attributes:
+        segments: of the IMU, by friction where it leads; `wheels` likewise.
+        noise: of the sensors, with the doubt of the gyro's scale.
+        rolled_m: mean distance of the wheels, also without the IMU.
+        in_gap: the IMU is missing; turn_rad: the turn then, where the wheels show it.
+    """
+
+    mean: MeanMotion
+    segments: list[ImuSegment]
+    noise: SensorNoise
+    rolled_m: float | None
+    wheels: WheelIncrement | None
+    in_gap: bool
+    turn_rad: float | None
+
+    @property
+    def in_pause(self) -> bool:
+        """Whether no sample came for long."""
+        return self.mean.dt_s > LONGEST_PAUSE_NS * 1e-9
+
+
+class MotionInput:
+    """Makes the motion up to a keyframe of the samples of IMU, wheels and steering."""
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        streams: tuple[ImuStream, WheelStream, SteeringStream],
+        skid: SkidDetector,
+        learned: LearnedNumbers,
+    ) -> None:
+        self._config, self._skid, self._learned = config, skid, learned
+        self._imu, self._wheels, self._steering = streams
+        self._turn, self._jitter = steered_turn(config.rig, config.inputs), WheelJitter()
+
+    def up_to(self, t_ns: int, chain: Chain, noise: SensorNoise) -> KeyframeMotion:
+        """From the newest keyframe of the chain to `t_ns`, on the ground of `noise`."""
+        inputs, friction = self._config.inputs, self._skid.friction
+        before_ns, before = chain.nodes[-1].t_ns, chain.state(chain.last)
+        dt_s = (t_ns - before_ns) * 1e-9
+        segments = self._imu.segments(before_ns, t_ns)
+        if inputs.planar:
+            segments = with_centripetal_force(segments, before)
+        in_gap, turn_rad = is_gap(self._imu.largest_gap_s(before_ns, t_ns), self._imu.t_ns), None
+        if in_gap and inputs.sides and self._turn is None:
+            sides_m = self._wheels.travelled(before_ns, t_ns)
+            turn_rad, segments = turn_in_gap(before, sides_m, self._config.rig.track_m, dt_s, segments)
+        rolled = wheels = self._increment(t_ns, segments, chain, noise)
+        noise = self._learned.with_doubt(noise, t_ns, segments)
+        if inputs.planar and wheels is not None:
+            segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt_s)
+        if friction is not None:
+            known = before, chain.covariance, self._skid.rate_m2ps
+            segments, wheels = friction.step(t_ns, dt_s, segments, wheels, *known)
+        rolled_m = None if rolled is None else rolled.distance_m
+        mean = MeanMotion(dt_s, None if in_gap else rolled_m, *mean_rates(segments))
+        return KeyframeMotion(mean, segments, noise, rolled_m, wheels, in_gap, turn_rad)
+
+    def _increment(
+        self, t_ns: int, segments: list[ImuSegment], chain: Chain, noise: SensorNoise
+    ) -> WheelIncrement | None:
+        before_ns, before = chain.nodes[-1].t_ns, chain.state(chain.last)
+        travelled = self._wheels.travelled(before_ns, t_ns)
+        if travelled is None:
+            return None
+        rig, inputs, calibrate = self._config.rig, self._config.inputs, self._config.calibrate
+        bias_z, change_mps = before.bias.gyroscope()[2], self._wheels.speed_change_mps(before_ns, t_ns)
+        increment = wheel_increment(
+            travelled, segments, float(bias_z), rig.track_m, rig.quantum_m, noise, change_mps, calibrate,
+            self._learned.course_lag_s(),
+        )  # fmt: skip
+        increment = self._jitter.applied(increment)
+        increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
+        if self._turn is not None:
+            return self._turn.between(before_ns, t_ns, increment, self._steering, chain.covariance)
+        return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
