@@ -35,7 +35,7 @@ from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.keyframe_motion import KeyframeMotion, MeanMotion, MotionInput
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
-from terrafusion.fusion.estimator.messages import add_message
+from terrafusion.fusion.estimator.messages import arguments_of
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
 from terrafusion.fusion.estimator.place_doubt import PlaceDoubt
@@ -124,8 +124,20 @@ class Estimator:
         return cls(EstimatorConfig(params.rig(), params.name, mode))
 
     def add(self, message: Message) -> None:
-        """One message of `Recording.messages()` or of a driver; see `messages.add_message`."""
-        add_message(self, message)
+        """One message of `Recording.messages()` or of a driver; see `messages.arguments_of`."""
+        if (read := arguments_of(message, self.config)) is None:
+            return
+        inlets: dict[str, Callable[..., None]] = {
+            "imu": self.add_imu,
+            "wheels": self.add_wheels,
+            "gnss": self.add_gnss,
+            "command": self.add_command,
+            "steering": self.add_steering,
+            "barometer": self.add_pressure,
+            "terrain": self.add_terrain,
+        }
+        channel, arguments = read
+        inlets[channel](message.t_ns, *arguments)
 
     def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
         """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import types
+from typing import Any
 
 import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Terrain
-from terrafusion.fusion.estimator.messages import add_message
+from terrafusion.fusion.estimator.messages import arguments_of
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
 
@@ -23,14 +24,9 @@ def camera(rows: list[list[float]], source: str = "camera") -> Terrain:
 
 def taken(terrain: Terrain) -> list[tuple[int, dict[str, float]]]:
     """What an estimator whose policy has the classes `KNOWN` is given of the messages."""
-    rows: list[tuple[int, dict[str, float]]] = []
-    estimator = types.SimpleNamespace(
-        config=types.SimpleNamespace(policy=types.SimpleNamespace(names=lambda: KNOWN)),
-        add_terrain=lambda t_ns, probabilities: rows.append((t_ns, probabilities)),
-    )
-    for message in terrain.samples():
-        add_message(estimator, message)  # type: ignore[arg-type]
-    return rows
+    config: Any = types.SimpleNamespace(policy=types.SimpleNamespace(names=lambda: KNOWN))
+    rows = [(message.t_ns, arguments_of(message, config)) for message in terrain.samples()]
+    return [(t_ns, *row[1]) for t_ns, row in rows if row is not None]
 
 
 def test_classes_the_policy_lacks_are_unknown_ground() -> None:
