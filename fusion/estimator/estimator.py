@@ -22,9 +22,11 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.robot import SKIDDING
+from terrafusion.datasets.core.tables import text_html
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, checked_config
-from terrafusion.fusion.estimate.estimate import Innovation, State
+from terrafusion.fusion.estimate.estimate import STATUS, Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
 from terrafusion.fusion.estimator.alignment import Start, checked_start, initial_state
@@ -91,6 +93,19 @@ class Estimator:
         self.config = dataclasses.replace(config, rig=rig, policy=policy)
         self._on_state, self._on_innovation, self.breakdowns = on_state, on_innovation, 0
         self.reset(archive)
+
+    def __repr__(self) -> str:
+        held, waiting = len(self.chain.nodes), len(self.gnss.waiting)
+        lines = [
+            f"Estimator ({self.config.vehicle or 'unnamed vehicle'}, {self.config.mode}): {self.status}",
+            f"  {STATUS[self.status]}",
+            f"  {counted(held, 'keyframe')} held, {counted(waiting, 'fix', 'fixes')} waiting",
+            f"  rejected: {self.gnss.rejected} GNSS, {self.wheels_rejected} wheels",
+        ]
+        return "\n".join(lines if self._state is None else [*lines, f"  {self._state!r}"])
+
+    def _repr_html_(self) -> str:
+        return text_html(repr(self))
 
     def reset(self, archive: Chain | None = None) -> None:
         """Back to before the first sample; configuration and callbacks stay."""

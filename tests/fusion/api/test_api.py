@@ -78,6 +78,7 @@ def test_what_is_shown_is_short(log: tf.Recording, result: tf.Replay) -> None:
 
 def test_a_live_state_is_one_line(log: tf.Recording) -> None:
     estimator = tf.Estimator.for_vehicle("elevate")
+    assert "no data that allow a start" in repr(estimator)
     for message in log.messages():
         estimator.add(message)
         if (state := estimator.latest()) is not None:
@@ -85,6 +86,11 @@ def test_a_live_state_is_one_line(log: tf.Recording) -> None:
     assert state is not None
     assert len(repr(state).splitlines()) == 1
     assert f"State at {state.t_ns} ns: {state.status}, position (" in repr(state)
+    lines = repr(estimator).splitlines()
+    assert lines[0] == f"Estimator (elevate, adaptive): {state.status}"
+    assert lines[-1].strip() == repr(state)
+    assert len(lines) <= 12
+    assert "(elevate, adaptive)" in estimator._repr_html_()
 
 
 def test_an_effect_may_be_named_alone() -> None:
