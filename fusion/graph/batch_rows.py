@@ -4,15 +4,15 @@ Rows of keyframe k are those of `Chain`: over k and k + 1, shape (m, 2 dim + 1),
 right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim rows, left free), the
 linear states' steps, the wheels (4), then whatever else a keyframe has.
 
-For speed the scalar factors of `Chain` are repeated here on arrays; tests/fusion/graph/test_batch.py compares
-both on random states.
+Fixes and velocities repeat `Chain`'s on arrays: one product of 3 x 3 has other bits than many, and is faster.
+tests/fusion/graph/test_batch.py compares both on random states.
 """
 
 import functools
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -27,22 +27,15 @@ from terrafusion.fusion.graph.key_state import (
     BIAS,
     DRIFT,
     GNSS_DELAY,
-    ICR_X,
     IMU_ROTATION,
     NAV,
     POSE,
-    RADIUS,
-    SIDE_SLIP,
-    SLIP,
-    SURGE_SLIP,
     VELOCITY,
-    WHEEL_DELAY,
-    YAW_SCALE,
     among_linear,
 )
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, linearised_steps
 
 Places = NDArray[np.intp]
 T = TypeVar("T")
@@ -182,19 +175,19 @@ class _Markov:
         n = dim - NAV.stop
         known = [step for step in steps if step is not None]
         self._at = np.array([step is not None for step in steps], dtype=bool)
-        self._decay, self._mean, self._sigma = (
-            np.array([getattr(step, name)[:n] for step in known]).reshape(-1, n)
-            for name in ("decay", "mean", "sigma")
+        names = ("decay", "mean", "sigma")
+        self._steps = MarkovStep(
+            *(np.array([getattr(step, name)[:n] for step in known]).reshape(-1, n) for name in names)
         )
         self._n, self._dim = n, dim
 
     def fill(self, rows: Array, before: Array, now: Array) -> None:
         """Rows (n, states, 2 dim + 1)."""
-        i, own = np.arange(self._n), np.zeros((len(self._decay), *rows.shape[1:]))
-        own[:, i, NAV.stop + i] = -self._decay / self._sigma
-        own[:, i, self._dim + NAV.stop + i] = 1.0 / self._sigma
-        wandered = self._decay * (before[self._at, : self._n] - self._mean)
-        own[:, :, -1] = -(now[self._at, : self._n] - self._mean - wandered) / self._sigma
+        steps, at, n = self._steps, self._at, self._n
+        i, own = np.arange(n), np.zeros((len(steps.decay), *rows.shape[1:]))
+        own[:, i, NAV.stop + i] = -steps.decay / steps.sigma
+        own[:, i, self._dim + NAV.stop + i] = 1.0 / steps.sigma
+        own[:, :, -1] = -steps.residual(before[at, :n], now[at, :n]) / steps.sigma
         rows[self._at] = own
 
 
@@ -204,61 +197,24 @@ class _Wheels:
     def __init__(self, increments: list[WheelIncrement | None]) -> None:
         known = [w for w in increments if w is not None]
         self._at = np.array([w is not None for w in increments], dtype=bool)
-        self._moved = np.array([w.displacement_m for w in known]).reshape(-1, 3)
-        self._sigma = np.array([w.sigma for w in known]).reshape(-1, 4)
+        moved_m = np.array([w.displacement_m for w in known]).reshape(-1, 3).T
+        sigma = np.array([w.sigma for w in known]).reshape(-1, 4).T
         names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps", "surge_m")
-        self._distance, self._turn, self._yaw, self._change, self._surge = (
-            np.array([getattr(w, name) for w in known], dtype=float) for name in names
-        )
+        numbers: list[Any] = [np.array([getattr(w, name) for w in known], dtype=float) for name in names]
+        self._increments = WheelIncrement(moved_m, sigma, *numbers)
 
     def fill(self, rows: Array, R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array) -> None:
         """Rows (n, 4, 2 dim + 1)."""
-        at = self._at
-        own = np.zeros((len(self._moved), *rows.shape[1:]))
+        at, dim = self._at, (rows.shape[2] - 1) // 2
         R = R_i[at].transpose(0, 2, 1)
-        moved = np.einsum("kij,kj->ki", R, p_j[at] - p_i[at])
-        T = R @ R_j[at]
-        dim = (rows.shape[2] - 1) // 2
-        self._by_poses(own, moved, T, dim)
-        states = np.zeros((len(own), 4, linear.shape[1]))
-        right = self._by_linear(states, moved, T, linear[at])
-        own[:, :, dim + NAV.stop : 2 * dim] = states[:, :, : dim - NAV.stop]
-        own[:, :, -1] = -right
-        rows[at] = own / self._sigma[:, :, None]
-
-    @staticmethod
-    def _by_poses(own: Array, moved: Array, T: Array, dim: int) -> None:
-        x, y, z = moved.T
-        own[:, 0, 1], own[:, 0, 2] = -z, y
-        own[:, 1, 0], own[:, 1, 2] = z, -x
-        own[:, 2, 0], own[:, 2, 1] = -y, x
-        own[:, [0, 1, 2], [3, 4, 5]] = -1.0
-        own[:, :3, dim + 3 : dim + 6] = T
-        level = T[:, 0, 0] ** 2 + T[:, 1, 0] ** 2
-        own[:, 3, 0] = T[:, 0, 0] * T[:, 2, 0] / level
-        own[:, 3, 1] = T[:, 1, 0] * T[:, 2, 0] / level
-        own[:, 3, 2] = -1.0
-        own[:, 3, dim + 1] = (T[:, 1, 0] * T[:, 0, 2] - T[:, 0, 0] * T[:, 1, 2]) / level
-        own[:, 3, dim + 2] = (T[:, 0, 0] * T[:, 1, 1] - T[:, 1, 0] * T[:, 0, 1]) / level
-
-    def _by_linear(self, H: Array, moved: Array, T: Array, linear: Array) -> Array:
-        """Derivatives (n, 4, 15) into H; the residuals (n, 4)."""
-        s, k, i, b, r, t, a = (
-            n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY, SURGE_SLIP)
-        )
-        rolled = self._moved.copy()
-        rolled[:, 0] += linear[:, t] * self._change
-        slip, radius = 1.0 - linear[:, [s]], 1.0 + linear[:, [r]]
-        H[:, :3, s], H[:, :3, r], H[:, 0, a] = radius * rolled, -slip * rolled, self._surge
-        H[:, 0, t] = -(slip * radius)[:, 0] * self._change
-        H[:, 1, b], H[:, 1, i] = -self._distance, self._yaw
-        H[:, 3, k] = -self._turn
-        out = np.empty((len(moved), 4))
-        out[:, :3] = moved - slip * radius * rolled
-        out[:, 0] += linear[:, a] * self._surge
-        out[:, 1] -= linear[:, b] * self._distance - linear[:, i] * self._yaw
-        out[:, 3] = np.arctan2(T[:, 1, 0], T[:, 0, 0]) - (1.0 + linear[:, k]) * self._turn
-        return out
+        moved, T = np.einsum("kij,kj->ki", R, p_j[at] - p_i[at]), R @ R_j[at]
+        left, *by_states = linearised_steps(moved.T, T.transpose(1, 2, 0), linear[at].T, self._increments)
+        by_before, by_now, by_linear = (H.transpose(2, 0, 1) for H in by_states)
+        own = np.zeros((len(moved), *rows.shape[1:]))
+        own[:, :, POSE], own[:, :, dim : dim + POSE.stop] = by_before, by_now
+        own[:, :, dim + NAV.stop : 2 * dim] = by_linear[:, :, : dim - NAV.stop]
+        own[:, :, -1] = -left.T
+        rows[at] = own / self._increments.sigma.T[:, :, None]
 
 
 def _first_rows(measurements: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:

@@ -104,27 +104,38 @@ def linearised(before: KeyState, now: KeyState, wheels: WheelIncrement) -> tuple
     Pose tangents are GTSAM's: rotation first, both parts in the body frame.
     """
     R_i, p_i, R_j, p_j = before.rotation, before.pose.translation(), now.rotation, now.pose.translation()
-    moved, T = R_i.T @ (p_j - p_i), R_i.T @ R_j
-    x, y, z = moved.tolist()
-    (c, _, e), (s, g, h), (a, _, _) = T.tolist()
-    state = now.linear.tolist()
+    return linearised_steps(R_i.T @ (p_j - p_i), R_i.T @ R_j, now.linear, wheels)
+
+
+def linearised_steps(
+    moved: Array, T: Array, linear: Array, wheels: WheelIncrement
+) -> tuple[Array, Array, Array, Array]:
+    """The same by R_i' (p_j - p_i) (3,), R_i' R_j (3, 3) and the linear states (15,) of the second keyframe.
+
+    For n increments at once all arrays have a last axis of that length, the numbers of `wheels` being (n,).
+    """
+    many = moved.shape[1:]
+    # Of a single step floats: they are faster than the scalars of NumPy.
+    place, turned, state = (moved, T, linear) if many else (moved.tolist(), T.tolist(), linear.tolist())
+    (x, y, z), ((c, d, e), (s, g, h), (a, _, _)) = place, turned
     slip, radius = 1.0 - state[_S], 1.0 + state[_R]
     rolled = wheels.displacement_m.copy()
     rolled[0] += state[_T] * wheels.speed_change_mps
-    out = np.empty(4)
+    out = np.empty((4, *many))
     out[:3] = moved - slip * radius * rolled
     out[0] += state[_A] * wheels.surge_m
     out[1] -= state[_B] * wheels.distance_m - state[_I] * wheels.yaw_rad
     out[3] = np.arctan2(s, c) - (1.0 + state[_K]) * wheels.turn_rad
     level = c * c + s * s
-    H_i, H_j, H_linear = np.zeros((4, 6)), np.zeros((4, 6)), np.zeros((4, MARKOV.stop - MARKOV.start))
+    H_i, H_j = np.zeros((4, 6, *many)), np.zeros((4, 6, *many))
+    H_linear = np.zeros((4, MARKOV.stop - MARKOV.start, *many))
     H_i[0, 1], H_i[0, 2] = -z, y
     H_i[1, 0], H_i[1, 2] = z, -x
     H_i[2, 0], H_i[2, 1] = -y, x
     H_i[0, 3] = H_i[1, 4] = H_i[2, 5] = -1.0
-    H_i[3, :3] = c * a / level, s * a / level, -1.0
+    H_i[3, 0], H_i[3, 1], H_i[3, 2] = c * a / level, s * a / level, -1.0
     H_j[:3, 3:] = T
-    H_j[3, 1:3] = (s * e - c * h) / level, (c * g - s * T[0, 1]) / level
+    H_j[3, 1], H_j[3, 2] = (s * e - c * h) / level, (c * g - s * d) / level
     H_linear[:3, _S], H_linear[:3, _R] = radius * rolled, -slip * rolled
     H_linear[0, _A] = wheels.surge_m
     H_linear[0, _T] = -slip * radius * wheels.speed_change_mps
