@@ -118,13 +118,12 @@ class Knowledge:
         Where the best one is negative, all numbers are as they are without any. What it may be all the same
         is a normal truncated at 0 (Johnson, Kotz, Balakrishnan 1994, sec. 10.1), here by its second moment.
         """
-        lag_s, covariance = float(self.mean[COURSE_LAG]), self.covariance
+        lag_s, covariance = self.mean[COURSE_LAG], self.covariance
         if lag_s >= 0.0:
             return self
-        sigma_s = float(self.sigma[COURSE_LAG])
-        off = -lag_s / sigma_s
-        square = 1.0 + off**2 - off * math.sqrt(2.0 / math.pi) / float(erfcx(off / math.sqrt(2.0)))
-        clipped_s = max(self.clipped_lag_s, sigma_s * math.sqrt(max(square, 0.0)))
+        off = -lag_s / self.sigma[COURSE_LAG]
+        square = 1.0 + off**2 - off * math.sqrt(2.0 / math.pi) / erfcx(off / math.sqrt(2.0))
+        clipped_s = max(self.clipped_lag_s, float(self.sigma[COURSE_LAG] * np.sqrt(max(square, 0.0))))
         gain = covariance[:, COURSE_LAG] / covariance[COURSE_LAG, COURSE_LAG]
         without = covariance - np.outer(gain, covariance[COURSE_LAG])
         without[COURSE_LAG, COURSE_LAG] = NO_LAG_SIGMA_S**2
