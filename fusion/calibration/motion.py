@@ -26,13 +26,14 @@ class MotionSegment:
 
     Attributes:
         t_s: (N + 1,) times; sample 0 is the start.
-        distance_m: (N,) mean distance of the wheels since the sample before.
+        distance_m: (N,) mean distance of the wheels along the body's x axis since the sample before.
         turn_rad: (N,) turn by its source since the sample before, as measured.
         fix_t_s: (F,) stamps of the fixes.
         fix: (F,) positions, east + i north, m.
         fix_sigma_m: (F,) 1 sigma of each axis.
         antenna_m: nominal lever arm, forward + i left, m.
         first: (M,) samples at which a node begins, from 0 on.
+        course_rad: (N,) angle from the body's x axis to where the wheels roll, as steered; None: along it.
     """
 
     t_s: Array
@@ -43,6 +44,7 @@ class MotionSegment:
     fix_sigma_m: Array
     antenna_m: complex
     first: NDArray[np.intp]
+    course_rad: Array | None = None
 
 
 def node_due(apart_s: float, rolled_m: float, fix_sigma_m: float) -> bool:
@@ -81,6 +83,8 @@ def dead_reckoned(drive: MotionSegment, numbers: Array, begin: int = 0, end: int
     per_s = 1.0 / np.maximum(dt, LEAST_STEP_S)
     lag_s, rate = numbers[COURSE_LAG], turn * per_s
     middle = np.exp(1j * (0.5 * (yaw[1:] + yaw[:-1]) - lag_s * rate))
+    if drive.course_rad is not None:
+        middle = middle * (1.0 + 1j * np.tan(drive.course_rad[begin:end]))
     yaw_by = np.zeros((len(yaw), len(NUMBERS)))
     yaw_by[:, TURN_SCALE] = yaw / rate_scale
     yaw_by[:, GYRO_BIAS] = -rate_scale * (t_s - t_s[0])

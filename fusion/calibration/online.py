@@ -53,8 +53,8 @@ class SelfCalibration:
         self._drive = _empty(self._antenna_m)
         self._first: list[int] = [0]
         self._now_s, self._node_s, self._stepped_s, self._rolled_m = 0.0, 0.0, 0.0, 0.0
-        # Newer than `_drive`: time, distance and turn of samples; time, east, north and sigma of fixes.
-        self._samples: list[tuple[float, float, float]] = []
+        # Newer than `_drive`: time, distance, turn, course of samples; time, east, north, sigma of fixes.
+        self._samples: list[tuple[float, float, float, float]] = []
         self._fixes: list[tuple[float, float, float, float]] = []
         self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
         self.usual_sigma_m = self.turned_rad = 0.0
@@ -72,11 +72,18 @@ class SelfCalibration:
             self._begin()
 
     def drive(
-        self, t_ns: int, distance_m: float | None, turn_rad: float, position_m: Array, yaw_rad: float
+        self,
+        t_ns: int,
+        distance_m: float | None,
+        turn_rad: float,
+        position_m: Array,
+        yaw_rad: float,
+        course_rad: float = 0.0,
     ) -> None:
         """Motion since the last call, by the wheels and by the source of yaw as measured.
 
-        `position_m` (2,) and `yaw_rad` are the estimate at `t_ns`, where a stretch begins.
+        `position_m` (2,) and `yaw_rad` are the estimate at `t_ns`, where a stretch begins; `course_rad` is of
+        `MotionSegment`.
         """
         if distance_m is None:
             self.restart()
@@ -85,7 +92,7 @@ class SelfCalibration:
             self._start_ns, self._start = t_ns, (complex(*position_m[:2]), yaw_rad)
             return
         self._now_s = (t_ns - self._start_ns) * 1e-9
-        self._samples.append((self._now_s, distance_m, turn_rad))
+        self._samples.append((self._now_s, distance_m, turn_rad, course_rad))
         self._rolled_m += abs(distance_m)
         self.turned_rad += abs(turn_rad)
         apart_s = self._now_s - self._node_s
@@ -167,17 +174,19 @@ class SelfCalibration:
 def _empty(antenna_m: complex) -> MotionSegment:
     none = np.zeros(0)
     at_start = np.zeros(1, dtype=int)
-    return MotionSegment(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, at_start)
+    return MotionSegment(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, at_start, none)
 
 
 def _extended(
     drive: MotionSegment,
-    samples: Sequence[tuple[float, float, float]],
+    samples: Sequence[tuple[float, float, float, float]],
     fixes: Sequence[tuple[float, float, float, float]],
     first: Sequence[int],
 ) -> MotionSegment:
     """A drive with what came since."""
-    t_s, distance_m, turn_rad = np.array(samples).reshape(-1, 3).T
+    t_s, distance_m, turn_rad, course_rad = np.array(samples).reshape(-1, 4).T
+    if drive.course_rad is not None:
+        course_rad = np.concatenate([drive.course_rad, course_rad])
     fix_t_s, east_m, north_m, sigma_m = np.array(fixes).reshape(-1, 4).T
     return MotionSegment(
         np.concatenate([drive.t_s, t_s]),
@@ -188,4 +197,5 @@ def _extended(
         np.concatenate([drive.fix_sigma_m, sigma_m]),
         drive.antenna_m,
         np.array(first),
+        course_rad,
     )

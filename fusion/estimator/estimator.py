@@ -273,7 +273,7 @@ class Estimator:
     @starts_anew
     def _advance(self, last: bool = False) -> None:
         if not self.chain.nodes:
-            start = self._search.find(self.imu, self.wheels, last)
+            start = self._search.find(self.imu, self.wheels, self.steering, last)
             if start is None:
                 return
             self._begin(start)
@@ -391,7 +391,9 @@ class Estimator:
         if fresh is None:
             return
         state, mean = fresh
-        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, mean.gyro_radps, mean.accel_mps2)
+        course_rad = self.steering.course_rad(state.t_ns - round(mean.dt_s * 1e9), state.t_ns)
+        readings = mean.gyro_radps, mean.accel_mps2
+        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, course_rad, *readings)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)

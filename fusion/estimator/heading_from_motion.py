@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from terrafusion.fusion.calibration.numbers import (
     NUMBERS,
 )
 from terrafusion.fusion.estimator.alignment import KnownStart, Start
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import GnssFix
 
@@ -91,6 +93,7 @@ def heading_from_motion(
     antenna_m: Array,
     ahead_m: float = 0.0,
     doubt: MotionDoubt = EXACT,
+    steering: SteeringStream | None = None,
 ) -> MotionStart | None:
     """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
 
@@ -99,6 +102,7 @@ def heading_from_motion(
     Args:
         antenna_m: lever arm (3,), body, m.
         ahead_m: of the `Rig`.
+        steering: its angles; None for wheels that all roll ahead.
 
     Returns:
         the start. Where the fixes hardly move though the wheels do, the heading is unknown. None with fewer
@@ -110,7 +114,7 @@ def heading_from_motion(
         return None
     t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
     lever = complex(ahead_m + antenna_m[0], antenna_m[1])
-    path = _antenna_path(imu, wheels, level, lever)
+    path = _antenna_path(imu, wheels, level, lever, steering)
     z, z_dot = path.at(t_fix), (path.at(t_fix + HALF_S) - path.at(t_fix - HALF_S)) / (2.0 * HALF_S)
     g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
     sigma_m = np.array([np.sqrt(f.sigma_m[0] * f.sigma_m[1]) for f in inside])
@@ -222,7 +226,9 @@ class AntennaPath:
         return np.stack([np.interp(t_s, self.t_s, column) for column in self.by.T], axis=1)
 
 
-def _antenna_path(imu: ImuStream, wheels: WheelStream, level: Start, lever: complex) -> AntennaPath:
+def _antenna_path(
+    imu: ImuStream, wheels: WheelStream, level: Start, lever: complex, steering: SteeringStream | None
+) -> AntennaPath:
     """The path since the start.
 
     The ground is taken for a plane: the path in it is projected by the attitude of the start.
@@ -233,7 +239,12 @@ def _antenna_path(imu: ImuStream, wheels: WheelStream, level: Start, lever: comp
     t_s = np.array([wheels.t_ns[i] - level.t_ns for i in index], dtype=float) * 1e-9
     distance = np.array([0.5 * (wheels.left_m[i] + wheels.right_m[i]) for i in index])
     turns = np.diff(np.interp(t_s, t_imu, measured))
-    drive = MotionSegment(t_s, np.diff(distance), turns, *NO_FIXES, lever, np.zeros(1, dtype=np.intp))
+    ahead, course = np.diff(distance), None
+    if steering is not None and steering.t_ns:
+        t_ns = [wheels.t_ns[i] for i in index]
+        course = np.array([steering.course_rad(a, b) for a, b in itertools.pairwise(t_ns)])
+        ahead = ahead * np.cos(course)
+    drive = MotionSegment(t_s, ahead, turns, *NO_FIXES, lever, np.zeros(1, dtype=np.intp), course)
     numbers = np.zeros(len(NUMBERS))
     numbers[GYRO_BIAS] = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0
     path = dead_reckoned(drive, numbers)

@@ -144,20 +144,33 @@ class LearnedNumbers:
         self.mounting.level.fix(fix, self._gnss.scale)
 
     def keyframe(
-        self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
+        self,
+        chain: Chain,
+        dt_s: float,
+        rolled_m: float | None,
+        course_rad: float,
+        gyro_radps: Array,
+        accel_mps2: Array,
     ) -> None:
         """Take the motion of `dt_s` up to the newest keyframe.
 
         Args:
             rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
+            course_rad: of the wheels, as steered, from the body's x axis.
             gyro_radps, accel_mps2: (3,) mean readings, corrected.
         """
         if self.calibration is not None:
-            self._drive(self.calibration, chain, rolled_m, float(gyro_radps[2]) * dt_s)
+            turn_rad = float(gyro_radps[2]) * dt_s
+            self._drive(self.calibration, chain, rolled_m, turn_rad, course_rad)
         self.mounting.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
 
     def _drive(
-        self, learning: SelfCalibration, chain: Chain, rolled_m: float | None, turn_rad: float
+        self,
+        learning: SelfCalibration,
+        chain: Chain,
+        rolled_m: float | None,
+        turn_rad: float,
+        course_rad: float,
     ) -> None:
         if self._gnss.local:
             learning.restart()
@@ -169,7 +182,7 @@ class LearnedNumbers:
         self._handle_skid(chain, learning, skid.rate_m2ps > 0.0)
         pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
         t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
-        learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
+        learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw(), course_rad)
 
     def advance(self, chain: Chain) -> None:
         """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new

@@ -19,6 +19,7 @@ from terrafusion.fusion.estimator.heading_from_motion import MotionDoubt, Motion
 from terrafusion.fusion.estimator.learned_numbers import prior_of
 from terrafusion.fusion.estimator.plausibility import plausible_fixes
 from terrafusion.fusion.estimator.stationarity import drop_before_start
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 
 SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
@@ -51,7 +52,7 @@ class StartSearch:
         self._antenna_m, self._ahead_m = np.array(config.rig.sensors.gnss.antenna_m), config.rig.ahead_m
         self._doubt = MotionDoubt(prior_of(config).covariance, 1.0 - WHITE_SHARE, gnss.drift_time_s)
 
-    def find(self, imu: ImuStream, wheels: WheelStream, last: bool) -> Start | None:
+    def find(self, imu: ImuStream, wheels: WheelStream, steering: SteeringStream, last: bool) -> Start | None:
         """The start, or None as long as there is none; `last`: no more samples will come."""
         if not imu.t_ns or not wheels.t_ns:
             return None
@@ -72,7 +73,7 @@ class StartSearch:
             self._newest_fix_came_ns = imu.t_ns[-1]
             fitting = plausible_fixes(fixes, wheels)
             place = self._antenna_m, self._ahead_m, self._doubt
-            found = heading_from_motion(imu, wheels, fitting, self.level, *place)
+            found = heading_from_motion(imu, wheels, fitting, self.level, *place, steering)
             if found is not None and self._clear(found, imu.t_ns[-1]):
                 self._gnss.refuse_waiting(fitting)
                 return found.start

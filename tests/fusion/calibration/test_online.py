@@ -32,7 +32,8 @@ def driven(
         turn = float(drive.turn_rad[i - 1]) if i else 0.0
         yaw += turn
         z += distance * np.exp(1j * yaw)
-        learning.drive(t_ns, distance, turn, np.array([z.real, z.imag]), yaw)
+        course = float(drive.course_rad[i - 1]) if i and drive.course_rad is not None else 0.0
+        learning.drive(t_ns, distance, turn, np.array([z.real, z.imag]), yaw, course)
         while j < len(drive.fix) and drive.fix_t_s[j] <= t_s:
             fix = np.array([drive.fix[j].real, drive.fix[j].imag, 0.0])
             learning.fix(begin_ns + round(drive.fix_t_s[j] * 1e9), fix, float(drive.fix_sigma_m[j]))
@@ -49,6 +50,20 @@ def test_numbers_are_found_while_driving_and_their_sigmas_shrink() -> None:
     error = np.abs(known[-1].mean - TRUE)[:6]
     assert (error < 4.0 * known[-1].sigma[:6] + [2e-3, 2e-4, 3e-3, 0.02, 0.02, 0.02]).all()
     assert (known[-1].sigma[:6] < 0.4 * known[0].sigma[:6]).all()
+
+
+def test_wheels_that_are_steered_to_one_side_are_not_taken_for_a_wrong_antenna_or_delay() -> None:
+    """Front and rear wheels turned alike: the robot moves aside, as it turns and changes its speed."""
+    drive = figure(240.0, 0.0 * TRUE, 0.02)
+    course = 0.3 * np.sin(0.23 * drive.t_s[1:])
+    yaw = np.cumsum(drive.turn_rad) - 0.5 * drive.turn_rad
+    aside = np.cumsum(1j * np.tan(course) * drive.distance_m * np.exp(1j * yaw))
+    moved = np.interp(drive.fix_t_s, drive.t_s[1:], aside.real) + 1j * np.interp(
+        drive.fix_t_s, drive.t_s[1:], aside.imag
+    )
+    steered = dataclasses.replace(drive, fix=drive.fix + moved, course_rad=course)
+    known = driven(steered, SelfCalibration(PRIOR, NOISE, 0j))[-1]
+    assert (np.abs(known.mean) < 3.0 * known.sigma + [1e-3, 1e-4, 2e-3, 0.01, 0.01, 0.01, 0.01, 0.01]).all()
 
 
 def test_numbers_that_are_far_off_are_found_without_waiting_for_more_ground() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.recording import Overrides
 from terrafusion.fusion.calibration.numbers import ANTENNA_X, GNSS_DELAY, NUMBERS
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.alignment import Start, level_start
@@ -21,8 +22,9 @@ from terrafusion.fusion.estimator.heading_from_motion import (
     _decorrelated,
     heading_from_motion,
 )
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.validation import GnssFix
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 
 Complex = NDArray[np.complex128]
 YAW_RAD, ORIGIN = 0.7, 10.0 + 5.0j
@@ -175,3 +177,20 @@ def test_a_robot_that_steers_starts_where_its_origin_is_and_not_its_rear_axle() 
     origin = ORIGIN + ahead_m * np.exp(1j * YAW_RAD)
     assert found.start.yaw_rad == pytest.approx(YAW_RAD, abs=0.02)
     assert found.start.position_m[:2] == pytest.approx([origin.real, origin.imag], abs=0.05)
+
+
+def test_wheels_that_are_steered_to_one_side_do_not_turn_the_heading() -> None:
+    """Front and rear wheels 0.3 rad to the left: the robot moves so far to the left of where it looks."""
+    side_rad = 0.3
+    estimator, level, times, places, _ = driven(1.0, 0.2)
+    robot = with_overrides(load_vehicle("elevate"), Overrides(drive="four_wheel_steer"))
+    steering = SteeringStream(robot.rig())
+    for i in range(301):
+        steering.add(i * 100_000_000, side_rad, side_rad)
+    fixes = [
+        GnssFix(round(t * 1e9), np.array([z.real, z.imag, 0.0]), np.full(3, 0.02))
+        for t, z in zip(times.tolist(), places.tolist(), strict=True)
+    ]
+    start = heading_from_motion(estimator.imu, estimator.wheels, fixes, level, np.zeros(3), steering=steering)
+    assert start is not None
+    assert start.start.yaw_rad == pytest.approx(YAW_RAD - side_rad, abs=0.02)
