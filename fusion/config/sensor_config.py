@@ -134,6 +134,26 @@ def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
     return SensorConfig(imu_kind(recording.imu), sides, fixes, steered, of_wheel)
 
 
+Sensors = SensorConfig | Recording | None
+"""A declaration of sensors; see `sensors_of`."""
+
+
+def sensors_of(declared: Sensors) -> SensorConfig:
+    """Sensors as declared, or those of a log; None: a six-axis IMU, both sides of the wheels, and fixes.
+
+    Raises:
+        ConfigError: it is neither.
+        DataError: no source of heading.
+    """
+    if isinstance(declared, Recording):
+        return sensor_config_of(declared, declared.gnss)
+    if declared is not None and not isinstance(declared, SensorConfig):
+        raise ConfigError(
+            f"sensors are declared by a {type(declared).__name__}", remedy="give a SensorConfig or a log"
+        )
+    return declared or SensorConfig()
+
+
 def complete_samples(imu: Imu, kind: str) -> np.ndarray:
     """Which samples (N,) of the IMU have all values that its kind needs."""
     if kind == "six_axis":

@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.messages import ImuSample, Message
 from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.robot import SKIDDING
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, checked_config
+from terrafusion.fusion.config.sensor_config import Sensors, sensors_of
 from terrafusion.fusion.estimate.estimate import STATUS, Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
@@ -62,10 +63,8 @@ from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.weighting import wheel_innovation_test
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-LONGEST_STEP_S = 1.0
-SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
-LAG_MARGIN = 5
-"""Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
+LONGEST_STEP_S, SMOOTH_EVERY, SMOOTH_WINDOW, LAG_MARGIN = 1.0, 5, 50, 5
+"""The last are held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 SEEN_LATE_NS, SWITCHED = 2_000_000_000, 0.1
 """A change of ground is detected after at most so long (docs/explanation/terrain.md: the 95 % of delays);
 smaller shifts are ignored."""
@@ -133,14 +132,18 @@ class Estimator:
         self._motion = MotionInput(config, streams, self._skid, self.learned)
 
     @classmethod
-    def for_vehicle(cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive") -> Estimator:
-        """An estimator for a vehicle, given by its name in the library, its YAML file or itself."""
+    def for_vehicle(
+        cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive", sensors: Sensors = None
+    ) -> Estimator:
+        """For a vehicle, given by name, YAML file or itself, with the `sensors` of `sensors_of`."""
         params = as_vehicle(vehicle)
-        return cls(EstimatorConfig(params.rig(), params.name, mode))
+        return cls(EstimatorConfig(params.rig(), params.name, mode, inputs=sensors_of(sensors)))
 
     def add(self, message: Message) -> None:
         """One message of `Recording.messages()` or of a driver; see `messages.arguments_of`."""
         if (read := arguments_of(message, self.config)) is None:
+            if isinstance(message, ImuSample) and self.config.inputs.imu != "none":
+                self.imu.leave_out()
             return
         inlets: dict[str, Callable[..., None]] = {
             "imu": self.add_imu,

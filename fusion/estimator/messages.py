@@ -25,6 +25,7 @@ from terrafusion.datasets.core.messages import (
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.steering import front_ratio
+from terrafusion.fusion.inputs.streams import DECLARE
 from terrafusion.fusion.inputs.validation import as_number, as_numbers
 from terrafusion.fusion.terrain.external import TRUE_SOURCES, known_probabilities
 
@@ -97,6 +98,10 @@ def _steering(message: SteeringSample, config: EstimatorConfig) -> Arguments | N
 
 def _wheels(message: WheelSample, config: EstimatorConfig) -> Arguments | None:
     radius_m, names = config.rig.wheel_radius_m, message.names
+    if len(names) == 1 and config.inputs.sides:
+        raise DataError(
+            "body speed alone, where the estimator expects both sides", channel="wheels", remedy=DECLARE
+        )
     speed = _vector(message.speed, len(names), "wheel speed", "wheels")
     left, right = _sides(speed, 1.0 if message.unit == "mps" else radius_m, names)
     if not math.isfinite(left + right):

@@ -60,6 +60,11 @@ GAP_INTERVALS, SLOWEST_INTERVAL_S = 2.5, 2.0
 INTERVALS_SEEN = 21
 HALF_NS = 50_000_000
 """Half of the time over which a speed is taken."""
+MOST_INCOMPLETE = 1000
+"""So many samples that miss an axis, and none that has all: the IMU is another than declared (assumed)."""
+DECLARE = (
+    "say what the robot has: Estimator.for_vehicle(vehicle, sensors=log), or a SensorConfig for `sensors`"
+)
 JUMP_M = 5.0
 """A counter that moves by this much more than a wheel of the fastest robot can has jumped (assumed)."""
 
@@ -100,12 +105,27 @@ class ImuStream(SampleStream):
         self.six_axis = six_axis
         self.turn_scale = self.mounting_rad = 0.0
         self.level: Array | None = None
-        self.spikes = 0
+        self.spikes = self.left_out = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
         self._accel_held_ns: list[int] = []
         self.gyro: list[Array] = []
         self.accel: list[Array] = []
+
+    def leave_out(self) -> None:
+        """Count a sample that misses an axis.
+
+        Raises:
+            DataError: `MOST_INCOMPLETE` came, and none that misses none.
+        """
+        self.left_out += 1
+        if not self.t_ns and self.left_out >= MOST_INCOMPLETE:
+            axes = "all six axes" if self.six_axis else "a turn rate about z"
+            raise DataError(
+                f"none of the first {MOST_INCOMPLETE} samples has {axes}, which the estimator expects",
+                channel="imu",
+                remedy=DECLARE,
+            )
 
     def add(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
         """A sample: rates (3,) and specific forces (3,).

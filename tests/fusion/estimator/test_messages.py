@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from typing import Any
 
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.messages import (
     CommandSample,
     GnssSample,
@@ -19,6 +20,7 @@ from terrafusion.datasets.core.messages import (
     WheelSample,
 )
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
@@ -47,6 +49,36 @@ def test_rows_with_missing_values_are_left_out(drive: Recording) -> None:
     estimator.add(ImuSample(drive.start_ns, nan, nan))
     estimator.add(GnssSample(drive.start_ns, nan, nan, 4, None, np.nan))
     assert not estimator.imu.t_ns
+
+
+def test_an_imu_of_one_axis_has_to_be_declared() -> None:
+    """As six axes are expected, it would give no estimate, without a word."""
+    log = simulate("figure_eight", terrain="asphalt", seed=1)
+    assert log.imu is not None
+    gyro = log.imu.gyro_radps.copy()
+    gyro[:, :2] = np.nan
+    log = dataclasses.replace(
+        log, imu=dataclasses.replace(log.imu, gyro_radps=gyro, accel_mps2=np.full_like(gyro, np.nan))
+    )
+    estimator = Estimator.for_vehicle("elevate")
+    with pytest.raises(DataError, match=r"none of the first 1000 samples has all six axes.*sensors=log"):
+        deque(map(estimator.add, log.messages()), maxlen=0)
+    declared = Estimator.for_vehicle("elevate", sensors=log)
+    for message in log.messages():
+        declared.add(message)
+    declared.finish()
+    state, estimate = declared.latest(), replay(log).estimate
+    assert state is not None
+    assert np.array_equal(state.position_m, estimate.trajectory.position_m[-1])
+
+
+def test_body_speed_where_both_sides_are_expected_is_refused(drive: Recording) -> None:
+    message = WheelSample(drive.start_ns, np.array([1.0]), ("mean",), "mps", None)
+    with pytest.raises(DataError, match="body speed alone"):
+        Estimator.for_vehicle("elevate").add(message)
+    Estimator.for_vehicle("elevate", sensors=SensorConfig(sides=False)).add(message)
+    with pytest.raises(ConfigError, match="sensors are declared by a str"):
+        Estimator.for_vehicle("elevate", sensors="gyro_z")  # type: ignore[arg-type]
 
 
 def test_what_is_no_message_is_refused(drive: Recording) -> None:
