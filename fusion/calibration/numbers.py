@@ -192,6 +192,13 @@ def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
     return dataclasses.replace(wide, mean=mean, covariance=np.diag(sigma**2))
 
 
+def antenna_sigma_m(known: SensorNumbers) -> tuple[float, float]:
+    """1 sigma of the antenna's place, forward and to the left, before the robot drives."""
+    wide = assumed(0.0, yaw_of_wheels=False, slip_spread=0.0, slip_time_s=1.0)
+    sigma = known_before(known, wide, "gyro").sigma
+    return float(sigma[ANTENNA_X]), float(sigma[ANTENNA_Y])
+
+
 def _change_sigma(yaw: str) -> Array:
     change = CHANGE_SIGMA.copy()
     if yaw != "gyro":

@@ -301,7 +301,7 @@ class Estimator:
         from_fixes = not self.gnss.local and self._search.known is None
         spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
         point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
-        point = self.learned.with_known_bias(point, start)
+        point, sigmas = self.learned.with_known(point, sigmas, start)
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
         for chain in filter(None, (self.chain, self.chain.archive)):
             chain.set_prior(sigmas[: chain.dim])

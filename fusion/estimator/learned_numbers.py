@@ -43,7 +43,7 @@ from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.kept import Kept
-from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.key_state import LINEAR, NAV, KeyState
 from terrafusion.fusion.graph.slow_states import SLIP_STEADY
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream
 from terrafusion.fusion.inputs.validation import GnssFix
@@ -63,6 +63,8 @@ TURN_TIME_S = 10.0
 """Duration of a turn in one direction, over which a wrong scale adds up without fixes (assumed)."""
 
 
+ANTENNA_STATES = [NAV.stop + LINEAR.index(name) for name in ("antenna_x_m", "antenna_y_m")]
+"""Of `--calibrate`, in a keyframe."""
 CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 """Numbers that correct a sensor; the others only describe its noise or belong to another state."""
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
@@ -130,12 +132,16 @@ class LearnedNumbers:
             self._bias_radps = float(prior.mean[GYRO_BIAS])
             self._apply(prior, 0)
 
-    def with_known_bias(self, point: KeyState, start: Start) -> KeyState:
-        """The first state, with the gyro's bias of earlier runs where the robot did not stand to show it."""
+    def with_known(self, point: KeyState, sigmas: Array, start: Start) -> tuple[KeyState, Array]:
+        """The first state and its 1 sigmas (DIM,), with what is known: the gyro's bias of earlier
+        runs where the robot did not stand to show it, and how well the antenna's place is known.
+        """
+        known = sigmas.copy()
+        known[ANTENNA_STATES] = self._before.sigma[[ANTENNA_X, ANTENNA_Y]]
         if start.gyro_bias_radps is not None or self._bias_radps == 0.0:
-            return point
+            return point, known
         gyro = np.array([0.0, 0.0, self._bias_radps])
-        return dataclasses.replace(point, bias=gtsam.imuBias.ConstantBias(np.zeros(3), gyro))
+        return dataclasses.replace(point, bias=gtsam.imuBias.ConstantBias(np.zeros(3), gyro)), known
 
     def fix(self, fix: GnssFix) -> None:
         """A fix as it came."""

@@ -50,7 +50,7 @@ CALIBRATION_SIGMA = {
     "gnss_delay_s": 0.1,
 }
 """Prior 1 sigma of a vehicle file (assumed: tyre wear and pressure, tape measure, mounting plate, driver
-clocks)."""
+clocks). The estimator replaces that of the antenna by `calibration.numbers.antenna_sigma_m`."""
 _ICR = ICR_X - NAV.stop
 _WALK_SIGMA = 2e-4 * np.array(list(CALIBRATION_SIGMA.values()))
 """Random walk of the calibration per sqrt(s), so that its covariance stays positive."""

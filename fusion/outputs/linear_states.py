@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.robot import SensorNumbers
+from terrafusion.fusion.calibration.numbers import antenna_sigma_m
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR
@@ -55,15 +57,17 @@ def series(estimate: Estimate, name: str) -> tuple[Array, Array] | None:
     return (estimate.linear[:, i], sigma) if np.isfinite(sigma).any() else None
 
 
-def calibration(estimate: Estimate) -> list[dict[str, Any]]:
+def calibration(estimate: Estimate, known: SensorNumbers | None = None) -> list[dict[str, Any]]:
     """What the last keyframe knows of each state of a calibration; empty where none was estimated.
 
     Rows of `state`, `value`, `sigma`, `prior_sigma` (SI, as the name says) and `observed`: sigma is less
-    than `OBSERVED_SHARE` of the prior's.
+    than `OBSERVED_SHARE` of the prior's. `known` is of the robot; None: nothing.
     """
+    antenna = zip(("antenna_x_m", "antenna_y_m"), antenna_sigma_m(known or SensorNumbers()), strict=True)
+    prior = CALIBRATION_SIGMA | dict(antenna)
     found = {name: series(estimate, name) for name in CALIBRATION}
     return [
-        _row(name, float(values[0][-1]), float(values[1][-1]), CALIBRATION_SIGMA[name])
+        _row(name, float(values[0][-1]), float(values[1][-1]), prior[name])
         for name, values in found.items()
         if values is not None
     ]

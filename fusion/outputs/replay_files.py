@@ -66,7 +66,10 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
         "weights": {"changes": len(estimate.changes)},
         "rejected": {"gnss": int(result.rejected_gnss), "wheels": int(result.rejected_wheels)},
         **_scored(scores),
-        "calibration": [finite(row) for row in calibration_of(estimate) or learned_rows(result.learned)],
+        "calibration": [
+            finite(row)
+            for row in calibration_of(estimate, result.vehicle.robot) or learned_rows(result.learned)
+        ],
         "status": final_status(estimate),
         "notes": [*estimate.notes, *(note for note in scores.notes if note not in estimate.notes)],
         "verdict": {"value": verdict.value, "reasons": list(verdict.reasons)},

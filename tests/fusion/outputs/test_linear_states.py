@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from terrafusion.datasets.core.json_text import to_json
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.calibration.numbers import ANTENNA_SIGMA_M
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
@@ -31,6 +32,7 @@ from terrafusion.twin.simulate import simulate
 from tests.fusion.replayed import result_of
 
 SCHEMA = Path(__file__).parents[3] / "docs" / "schemas" / "metrics.schema.json"
+PRIOR = CALIBRATION_SIGMA | dict.fromkeys(("antenna_x_m", "antenna_y_m"), ANTENNA_SIGMA_M)
 WANDERING = LINEAR[1 : LINEAR.index("radius_scale")]
 
 
@@ -39,7 +41,7 @@ def with_states(estimate: Estimate, calibrated: bool) -> Estimate:
     n = len(estimate.trajectory)
     value = np.tile(0.01 * np.arange(1, len(LINEAR) + 1), (n, 1))
     sigma = np.full((n, len(LINEAR)), 0.05)
-    for name, prior in CALIBRATION_SIGMA.items():
+    for name, prior in PRIOR.items():
         share = 0.4 if name.startswith("antenna") else 0.9
         sigma[:, LINEAR.index(name)] = share * prior
     if not calibrated:
@@ -64,7 +66,7 @@ def test_every_state_of_a_calibration_has_its_unit_and_prior(drive: Any) -> None
     rows = calibration(with_states(drive().estimate, calibrated=True))
     assert tuple(row["state"] for row in rows) == CALIBRATION == tuple(QUANTITIES) == tuple(CALIBRATION_SIGMA)
     assert [row["state"] for row in rows if row["observed"]] == ["antenna_x_m", "antenna_y_m"]
-    told, prior = {row["state"]: cells(row) for row in rows}, CALIBRATION_SIGMA["antenna_x_m"]
+    told, prior = {row["state"]: cells(row) for row in rows}, PRIOR["antenna_x_m"]
     assert told["antenna_x_m"][1:] == ["0.080", f"{0.4 * prior:.3f}", f"{prior:.3f}", "observed"]
     yaw_deg = np.degrees(0.01 * (LINEAR.index("imu_yaw_rad") + 1))
     assert told["imu_yaw_rad"][0].endswith(", deg")
