@@ -118,6 +118,10 @@ def _header(data: bytes, known: ChannelColumns) -> list[str]:
     except csv.Error as error:
         raise not_a_table(1, error) from None
     limits.check_columns(len(header))
+    for mark, named in ((";", "a semicolon"), ("\t", "a tab")):
+        if len(header) == 1 and mark in header[0]:
+            what = f"the columns are separated by {named}"
+            raise DataError(what, remedy="write commas, and points in decimal numbers")
     allowed = ["t_s", *known.numbers, *known.texts]
     for name in header:
         if name in allowed or any(name.startswith(p) and name != p for p in known.prefixes):

@@ -92,7 +92,11 @@ def forms_of(effect: str) -> list[Form]:
 
 
 def _unknown(name: str, near: Sequence[str]) -> ConfigError:
-    remedy = f"did you mean {' or '.join(near)}" if near else "see docs/reference/effects.md"
+    remedy = (
+        f"did you mean {' or '.join(near)}"
+        if near
+        else "`terrafusion simulate spin --effect help` lists them"
+    )
     return ConfigError(f"unknown effect '{name}'", remedy=remedy)
 
 

@@ -203,6 +203,8 @@ BAD_TABLES = {
     "word": ("imu", "t_s,gyro_z_radps\n0,0.1\n0.5,fast\n", ["gyro_z_radps", "'fast'", "line 3"]),
     "NA": ("imu", "t_s,gyro_z_radps\n0,NA\n", ["'NA'"]),
     "underscore": ("imu", "t_s,gyro_z_radps\n0,1_0\n", ["'1_0'"]),
+    "semicolons": ("imu", "t_s;gyro_z_radps\n0,0;0,1\n", ["separated by a semicolon", "commas"]),
+    "tabs": ("imu", "t_s\tgyro_z_radps\n0\t1\n", ["separated by a tab", "commas"]),
     "decimal comma": ("imu", "t_s,gyro_z_radps\n0,0,1\n0,1,1\n", ["line 2", "3 cells for 2 columns"]),
     "short line": (
         "imu",
