@@ -176,3 +176,9 @@ def two(names: tuple[str, str], unit: str, scale: float, limit: float) -> tuple[
 def braked(q: Quantities, torque: Any) -> dict[str, Any]:
     """A wheel with a torque against its rotation."""
     return {"drag_torque_nm": q["drag_torque_nm"] + torque}
+
+
+def turning_beside(q: Quantities, e: Any) -> dict[str, Any]:
+    """A body that turns about a point e to the right of its middle: the side with more load or grip slips
+    less. All sensors move as if they sat e further left."""
+    return {name: q[name] + e for name in ("imu_y_m", "antenna_y_m")}

@@ -5,7 +5,7 @@ from typing import Any
 
 import casadi as ca
 
-from terrafusion.twin.effects.form import Form, Quantities, braked, one
+from terrafusion.twin.effects.form import Form, Quantities, braked, one, turning_beside
 from terrafusion.twin.physics.smooth import grown, saturate, smooth_abs
 from terrafusion.twin.physics.wheel import RESISTANCE_SPEED_MPS
 
@@ -228,5 +228,9 @@ FORMS = (
         "left_right_friction", "lane", one("", 0.2, -1.5, 1.5),
         {"ground": lambda q, e: scaled_shear(q, ca.exp(0.5 * e * ca.tanh(q["wheel_y_m"] / LANE_BORDER_M)))},
         "strength times exp(e/2 tanh(y / 0.1 m)), y of the wheel in the plane", "ours",
+    ),
+    Form(
+        "left_right_friction", "turning_centre", one("m", 0.05, -0.5, 0.5), {"mounting": turning_beside},
+        "the body turns about a point e to the right of its middle", "kinematics (Mandow 2007)",
     ),
 )  # fmt: skip

@@ -5,7 +5,7 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Parameter, Quantities, braked, one
+from terrafusion.twin.effects.form import Form, Parameter, Quantities, braked, one, turning_beside
 from terrafusion.twin.physics.layout import WHEELS
 from terrafusion.twin.physics.smooth import grown
 
@@ -102,6 +102,10 @@ FORMS = (
         "cg_lateral", "transfer", one("m", 0.1, -0.5, 0.5),
         {"vehicle": lambda q, e: {"cg_left_m": q["cg_left_m"] - e * q["r"] * q["u"] / GRAVITY_MPS2}},
         "centre of gravity moves out of the turn by e r u / g", "ours: a load that slides",
+    ),
+    Form(
+        "cg_lateral", "turning_centre", one("m", 0.05, -0.5, 0.5), {"mounting": turning_beside},
+        "the body turns about a point e to the right of its middle", "kinematics (Mandow 2007)",
     ),
     Form(
         "cg_longitudinal", "shift", one("m", 0.02, -0.2, 0.2),

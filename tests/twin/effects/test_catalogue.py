@@ -56,7 +56,8 @@ REACH = {
 """States whose derivative a term at a stage can change at once; what lies upstream it cannot."""
 
 ODD = {
-    "left_right_friction/sides", "left_right_friction/lane", "cg_lateral/shift",
+    "left_right_friction/sides", "left_right_friction/lane", "left_right_friction/turning_centre",
+    "cg_lateral/shift", "cg_lateral/turning_centre",
     "wheel_radius_asymmetry/sides", "gyro_bias/constant", "gyro_bias/warm_up", "gyro_scale/asymmetry",
     "accel_bias/constant/y",
     "accel_bias/warm_up/y", "imu_yaw_misalignment/rotation", "imu_yaw_misalignment/cross_axis",
