@@ -20,8 +20,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.shared_errors import (
     ChannelNoise,
-    SharedGains,
-    learn_gains,
+    learn_gain,
     without_shared,
 )
 
@@ -63,12 +62,12 @@ def learn_noise(
     for _ in range(1 if before else 2):
         now, series = noise, dict[str, Series]()
         rests = in_threads(jobs, lambda run, now=now: _fit_residuals(run, now, sigma, size), runs)
-        gains = learn_gains((run.log, rest) for run, rest in zip(runs, rests, strict=True))
+        turn = learn_gain((run.log, rest) for run, rest in zip(runs, rests, strict=True))
         for run, rest in zip(runs, rests, strict=True):
-            for channel, pairs in _series(run, now, gains, rest).items():
+            for channel, pairs in _series(run, now, turn, rest).items():
                 series.setdefault(channel, []).extend(pairs)
         found = {c: _channel_noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
-        noise = ChannelNoise(found, gains)
+        noise = ChannelNoise(found, turn)
     return noise
 
 
@@ -115,12 +114,10 @@ def _fit_residuals(run: RunResiduals, noise: ChannelNoise, sigma: Array, size: f
     return by_channel(run.log, physical_error(white, noise, rows[:, -1] - rows[:, :-1] @ fit))
 
 
-def _series(
-    run: RunResiduals, noise: ChannelNoise, gains: SharedGains, rest: Sequence[Array]
-) -> dict[str, Series]:
+def _series(run: RunResiduals, noise: ChannelNoise, turn: float, rest: Sequence[Array]) -> dict[str, Series]:
     """Residuals without the errors that channels share, in units of the data sheets' sigma, by channel and
     window."""
-    own = without_shared(run.log, gains, [r[:, None] for r in rest])
+    own = without_shared(run.log, turn, [r[:, None] for r in rest])
     out = dict[str, Series]()
     for i, _, mine in sample_map(run.log).blocks:
         observed = run.log.observed[i]

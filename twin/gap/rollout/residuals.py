@@ -334,7 +334,7 @@ def noise_sigma(observed: Observed, noise: ResidualNoise) -> Array:
 def whitened_columns(log: PreparedLog, noise: ChannelNoise, columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, given one array a channel, in units and axes in which the noise is
     white."""
-    columns = without_shared(log, noise.gains, columns)
+    columns = without_shared(log, noise.turn, columns)
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
     sigma = [noise_sigma(o, noise[o.channel]) for o in log.observed]
     for i, rows, places in sample_map(log).equally_spaced:
@@ -354,7 +354,7 @@ def physical_error(run: WhitenedRun, noise: ChannelNoise, error: Array) -> Array
         out[places] = noise[observed.channel].unwhiten_alike(
             observed.slot[rows[0]], sigma[i][rows], error[places]
         )
-    whole = with_shared(run.log, noise.gains, [c[:, None] for c in by_channel(run.log, out)])
+    whole = with_shared(run.log, noise.turn, [c[:, None] for c in by_channel(run.log, out)])
     return np.concatenate([whole[i][rows, 0] for i, _, rows in sample_map(run.log).blocks])
 
 
