@@ -101,10 +101,11 @@ def diagnose_evidence(
     """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
     candidates, runs, notes = evidence.candidates, evidence.runs, list(evidence.notes)
     # null: how scores scatter where nothing has changed
-    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
+    uncalibrated = len(evidence.references) < FEWEST
+    imu = evidence.model.vehicle.sensors.imu if uncalibrated else None
+    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates, imu))
     scores = [score(run, sigma) for run in runs]
     normal = [score(run, sigma) for run in evidence.references]
-    uncalibrated = len(normal) < FEWEST
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
         in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0

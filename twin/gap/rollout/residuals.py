@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
@@ -290,10 +291,15 @@ def soil_columns(candidates: Candidates) -> list[int]:
     return [candidates.keys.index(name) for name in SOIL_SIGMAS if name in candidates.keys]
 
 
-def initial_state_sigma(candidates: Candidates) -> Array:
-    """First 1 sigma (T,) of the states, in units of their columns."""
+def initial_state_sigma(candidates: Candidates, imu: ImuSpec | None = None) -> Array:
+    """First 1 sigma (T,) of the states, in units of their columns; with an IMU, its offsets are at least as
+    large as its file says."""
     soil = [sigma for name, sigma in SOIL_SIGMAS.items() if name in candidates.keys]
-    return np.array([*soil, *np.ones(len(OFFSET_SIGMAS) + 2 * len(CURRENTS))])
+    offsets = np.ones(len(OFFSET_SIGMAS))
+    if imu is not None:
+        sheet = imu.gyro_bias_sigma_radps, imu.accel_bias_sigma_mps2, imu.accel_bias_sigma_mps2
+        offsets = np.maximum(np.array(sheet) / [*OFFSET_SIGMAS.values()], offsets)
+    return np.array([*soil, *offsets, *np.ones(2 * len(CURRENTS))])
 
 
 def with_timing(log: PreparedLog, predicted: Sequence[Array]) -> PreparedLog:
