@@ -63,8 +63,9 @@ from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.weighting import wheel_innovation_test
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-LONGEST_STEP_S, SMOOTH_EVERY, SMOOTH_WINDOW, LAG_MARGIN = 1.0, 5, 50, 5
-"""The last are held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
+LONGEST_STEP_S, SMOOTH_EVERY, SMOOTH_WINDOW = 1.0, 5, 50
+LAG_MARGIN = 5
+"""Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 SEEN_LATE_NS, SWITCHED = 2_000_000_000, 0.1
 """A change of ground is detected after at most so long (docs/explanation/terrain.md: the 95 % of delays);
 smaller shifts are ignored."""
@@ -394,9 +395,8 @@ class Estimator:
         if fresh is None:
             return
         state, mean = fresh
-        course_rad = self.steering.course_rad(state.t_ns - round(mean.dt_s * 1e9), state.t_ns)
         readings = mean.gyro_radps, mean.accel_mps2
-        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, course_rad, *readings)
+        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, mean.course_rad, *readings)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)

@@ -26,11 +26,13 @@ class MeanMotion:
 
     Attributes:
         rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
+        course_rad: of the wheels, as steered, from the body's x axis.
         gyro_radps, accel_mps2: (3,) mean readings, corrected.
     """
 
     dt_s: float
     rolled_m: float | None
+    course_rad: float
     gyro_radps: Array
     accel_mps2: Array
 
@@ -94,7 +96,8 @@ class MotionInput:
             known = before, chain.covariance, self._skid.rate_m2ps
             segments, wheels = friction.step(t_ns, dt_s, segments, wheels, *known)
         rolled_m = None if rolled is None else rolled.distance_m
-        mean = MeanMotion(dt_s, None if in_gap else rolled_m, *mean_rates(segments))
+        course_rad = self._steering.course_rad(before_ns, t_ns)
+        mean = MeanMotion(dt_s, None if in_gap else rolled_m, course_rad, *mean_rates(segments))
         return KeyframeMotion(mean, segments, noise, rolled_m, wheels, in_gap, turn_rad)
 
     def _increment(
