@@ -21,7 +21,7 @@ SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gap")
-    for recording in [*runs(100, 6), *runs(300, 2, {"wheel_radius/scale": 0.03})]:
+    for recording in [*runs(100, 6), *runs(300, 2, {"wheel_radius/scale": 0.04})]:
         write_log_folder(recording, folder / recording.name)
     return folder
 
