@@ -143,8 +143,8 @@ class Estimator:
     def add(self, message: Message) -> None:
         """One message of `Recording.messages()` or of a driver; see `messages.arguments_of`."""
         if (read := arguments_of(message, self.config)) is None:
-            if isinstance(message, ImuSample) and self.config.inputs.imu != "none":
-                self.imu.leave_out()
+            if isinstance(message, ImuSample) and self.config.inputs.imu == "six_axis":
+                self.imu.leave_out(message.gyro_radps)
             return
         inlets: dict[str, Callable[..., None]] = {
             "imu": self.add_imu,

@@ -112,17 +112,16 @@ class ImuStream(SampleStream):
         self.gyro: list[Array] = []
         self.accel: list[Array] = []
 
-    def leave_out(self) -> None:
-        """Count a sample that misses an axis.
+    def leave_out(self, gyro_radps: ArrayLike) -> None:
+        """Count a sample that turns about z (rates (3,), rad/s) but misses another axis.
 
         Raises:
             DataError: `MOST_INCOMPLETE` came, and none that misses none.
         """
-        self.left_out += 1
+        self.left_out += bool(np.isfinite(np.asarray(gyro_radps, dtype=float)[2]))
         if not self.t_ns and self.left_out >= MOST_INCOMPLETE:
-            axes = "all six axes" if self.six_axis else "a turn rate about z"
             raise DataError(
-                f"none of the first {MOST_INCOMPLETE} samples has {axes}, which the estimator expects",
+                f"none of the first {MOST_INCOMPLETE} samples has all six axes, which the estimator expects",
                 channel="imu",
                 remedy=DECLARE,
             )

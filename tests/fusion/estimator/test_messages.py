@@ -22,6 +22,7 @@ from terrafusion.datasets.core.messages import (
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.streams import MOST_INCOMPLETE
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
 
@@ -48,6 +49,13 @@ def test_rows_with_missing_values_are_left_out(drive: Recording) -> None:
     nan = np.full(3, np.nan)
     estimator.add(ImuSample(drive.start_ns, nan, nan))
     estimator.add(GnssSample(drive.start_ns, nan, nan, 4, None, np.nan))
+    assert not estimator.imu.t_ns
+
+
+def test_a_driver_that_warms_up_for_long_is_no_other_imu() -> None:
+    estimator, nan = Estimator.for_vehicle("elevate"), np.full(3, np.nan)
+    for i in range(2 * MOST_INCOMPLETE):
+        estimator.add(ImuSample(i * 5_000_000, nan, nan))
     assert not estimator.imu.t_ns
 
 
