@@ -30,7 +30,7 @@ def alignment_angles(log: PreparedLog, values: Sequence[Array]) -> Array:
     velocities together.
     """
     turn = np.full(len(log.windows), HEADING_SIGMA_RAD**-2.0, dtype=complex)
-    for pair, east, north, window in _pairs(log):
+    for pair, east, north, window in tracks(log):
         observed, predicted = _observed(log, east, north), values[east] + 1j * values[north]
         if pair == EAST_NORTH[0]:
             observed, predicted = (z - _means(z, window, len(turn))[window] for z in (observed, predicted))
@@ -43,7 +43,7 @@ def aligned_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Ar
     """Poses (W, 3) at the windows' starts that align the predictions, made from the poses `start`."""
     out, turn = start.copy(), alignment_angles(log, values)
     out[:, 2] += turn
-    for pair, east, north, window in _pairs(log):
+    for pair, east, north, window in tracks(log):
         if pair == EAST_NORTH[0]:
             observed, predicted = _observed(log, east, north), values[east] + 1j * values[north]
             before, after = (_means(z, window, len(out)) for z in (predicted, observed))
@@ -67,7 +67,7 @@ def rotated(
     """Channels (n, ...) with the east and north ones of each window rotated by an angle (W,), and positions
     shifted (W,)."""
     out = list(channels)
-    for pair, east, north, window in _pairs(log):
+    for pair, east, north, window in tracks(log):
         at = angle[window].reshape(-1, *[1] * (channels[east].ndim - 1))
         turned = np.exp(1j * at) * (channels[east] + 1j * channels[north])
         if shift is not None and pair == EAST_NORTH[0]:
@@ -81,7 +81,7 @@ def window_index(log: PreparedLog, channel: int) -> Indices:
     return np.clip(window_of(log.observed[channel], log.windows), 0, len(log.windows) - 1)
 
 
-def _pairs(log: PreparedLog) -> list[tuple[tuple[str, str], int, int, Indices]]:
+def tracks(log: PreparedLog) -> list[tuple[tuple[str, str], int, int, Indices]]:
     """Of `EAST_NORTH` what the log has, with the indices of both channels and the window of each sample."""
     index = {o.channel: i for i, o in enumerate(log.observed)}
     known = [pair for pair in EAST_NORTH if {*pair} <= index.keys()]

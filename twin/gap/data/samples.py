@@ -91,6 +91,14 @@ def weighted_means(samples: tuple[Indices, Array], values: Array) -> Array:
     return np.asarray(out)
 
 
+def interpolated(at_s: Array, known_s: Array, values: Array) -> Array:
+    """Values (n, ...) at times (n,) linearly interpolated to others (m,), constant beyond the ends."""
+    place = np.interp(at_s, known_s, np.arange(float(len(known_s))))
+    low = np.minimum(place.astype(np.int64), max(len(known_s) - 2, 0))
+    share = (place - low).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((1.0 - share) * values[low] + share * values[np.minimum(low + 1, len(known_s) - 1)])
+
+
 def drop_zero_weights(at: Indices, weight: Array) -> tuple[Indices, Array]:
     """The same samples without columns that all have weight zero."""
     order = np.argsort(weight == 0.0, axis=1, kind="stable")

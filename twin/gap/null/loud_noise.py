@@ -14,11 +14,11 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.samples import Indices, sample_map, with_observed
+from terrafusion.twin.gap.rollout.measured_turns import NORMAL_MEDIAN
 from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun
 
 STRETCH = 32  # samples over which noise is taken to be equally loud (assumed)
 LOUD = 3.0  # times the references' variance from which a stretch counts as louder: above its own scatter
-NORMAL_MEDIAN = 0.455  # median square of a standard normal deviate
 
 
 def reference_loudness(references: Sequence[WhitenedRun]) -> Array:

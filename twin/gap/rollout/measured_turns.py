@@ -16,8 +16,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.observations import Observed
-from terrafusion.twin.gap.data.poses import EAST_NORTH, window_index
-from terrafusion.twin.gap.data.samples import Indices
+from terrafusion.twin.gap.data.poses import EAST_NORTH, tracks, window_index
+from terrafusion.twin.gap.data.samples import Indices, interpolated
 
 GYRO = "yaw_rate_radps"
 UNSURE_RAD = 0.05
@@ -38,7 +38,7 @@ def turned_apart(log: PreparedLog, values: Sequence[Array], at: int) -> Array:
 def as_measured(log: PreparedLog, values: Sequence[Array], channels: Sequence[Array]) -> list[Array]:
     """Channels (n, ...), their tracks turned as the gyro measured; `values` (n,) are what is predicted."""
     out = list(channels)
-    for pair, east, north in _tracks(log):
+    for pair, east, north, _ in tracks(log):
         turn = np.exp(1j * turned_apart(log, values, east)).reshape(-1, *[1] * (channels[east].ndim - 1))
         track = channels[east] + 1j * channels[north]
         if pair == EAST_NORTH[1]:
@@ -55,7 +55,7 @@ def with_heading_errors(log: PreparedLog, values: Sequence[Array], columns: Sequ
     gyro, out = _gyro(log), list(columns)
     if gyro is None:
         return out
-    for pair, east, north in _tracks(log):
+    for pair, east, north, _ in tracks(log):
         angle = _integral(log, gyro, east, columns[gyro])
         track = (values[east] + 1j * values[north])[:, None]
         moved = angle * track if pair == EAST_NORTH[1] else _sums(log, east, _between(angle) * _steps(track))
@@ -65,12 +65,6 @@ def with_heading_errors(log: PreparedLog, values: Sequence[Array], columns: Sequ
 
 def _gyro(log: PreparedLog) -> int | None:
     return next((i for i, o in enumerate(log.observed) if o.channel == GYRO), None)
-
-
-def _tracks(log: PreparedLog) -> list[tuple[tuple[str, str], int, int]]:
-    """Of `EAST_NORTH` what the log has, with the indices of both channels."""
-    index = {o.channel: i for i, o in enumerate(log.observed)}
-    return [(pair, index[pair[0]], index[pair[1]]) for pair in EAST_NORTH if {*pair} <= index.keys()]
 
 
 def _integral(log: PreparedLog, gyro: int, at: int, rates: Array) -> Array:
@@ -86,10 +80,7 @@ def _integral(log: PreparedLog, gyro: int, at: int, rates: Array) -> Array:
             edges = np.append(rate.begin_s[mine], rate.end_s[mine[-1]])
             angle = _trust(rate, mine) * np.cumsum(np.diff(edges)[:, None] * rates[mine], axis=0)
             angle = np.vstack([np.zeros_like(angle[:1]), angle])
-            place = np.interp(fix.end_s[there], edges, np.arange(float(len(edges))))
-            low = np.minimum(place.astype(np.int64), len(edges) - 2)
-            share = (place - low)[:, None]
-            out[there] = (1.0 - share) * angle[low] + share * angle[low + 1]
+            out[there] = interpolated(fix.end_s[there], edges, angle)
     return out
 
 

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-import numpy as np
-
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.noise import ResidualNoise
+from terrafusion.twin.gap.data.samples import interpolated
 from terrafusion.twin.gap.rollout.measured_turns import GYRO
 
 WHEELS = "wheel_left_radps", "wheel_right_radps"
@@ -65,13 +64,5 @@ def _shown(log: PreparedLog, columns: Sequence[Array]) -> tuple[int, Array] | No
     if not {*WHEELS, GYRO} <= at.keys():
         return None
     middle = [0.5 * (log.observed[at[c]].begin_s + log.observed[at[c]].end_s) for c in (*WHEELS, GYRO)]
-    left, right = (_at(middle[2], middle[i], columns[at[c]]) for i, c in enumerate(WHEELS))
+    left, right = (interpolated(middle[2], middle[i], columns[at[c]]) for i, c in enumerate(WHEELS))
     return at[GYRO], right - left
-
-
-def _at(at_s: Array, known_s: Array, values: Array) -> Array:
-    """Values (n, ...) interpolated to other times (m,), constant beyond the ends."""
-    place = np.interp(at_s, known_s, np.arange(float(len(known_s))))
-    low = np.minimum(place.astype(np.int64), max(len(known_s) - 2, 0))
-    share = (place - low).reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray((1.0 - share) * values[low] + share * values[np.minimum(low + 1, len(known_s) - 1)])
