@@ -5,6 +5,7 @@ the catalogue is, its laws, and how to check it on the robot.
 import functools
 import math
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 from terrafusion.datasets.core.printable import counted
@@ -41,7 +42,7 @@ def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PL
     """Sentences by title, none without any; at most so many places, explained effects and channels."""
     found = {
         "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most),
-        "Next": _next(d), "Load": _load(corrected) if d.verdict.named else [],
+        "Next": _next(d), "Load": _load(corrected) if d.verdict.named else [], "Runs": [_compared(d)],
     }  # fmt: skip
     return {title: sentences for title, sentences in found.items() if sentences}
 
@@ -183,6 +184,18 @@ def alternatives_text(s: CredibleSet, certain: str = "") -> str:
     if len(names) == 1:
         return names[0] + after
     return f"{', '.join(names[:-1])} or {names[-1]}{after}, which these drives cannot tell apart"
+
+
+def _compared(d: GapDiagnosis) -> str:
+    """What was judged beside what, so that a reference given as a run is seen."""
+    judged = f"judged: {_some(d.runs)}"
+    return f"{judged}; references: {_some(d.references)}" if d.references else f"{judged}; no references"
+
+
+def _some(names: Sequence[str]) -> str:
+    """ "a, b, c and 9 more"."""
+    more = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _places(d: GapDiagnosis, most: int) -> list[str]:

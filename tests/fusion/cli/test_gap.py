@@ -56,7 +56,9 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 100
     titles = [line.split()[0] for line in lines[1:] if not line.startswith(" ")]
-    assert [t for t in titles if t[0].isupper()] == ["Where", "Which", "Shrinks", "Next", "Load", "Details"]
+    sections = ["Where", "Which", "Shrinks", "Next", "Load", "Runs", "Details"]
+    assert [t for t in titles if t[0].isupper()] == sections
+    assert "run103 and 2 more" in " ".join(done.out.split())
     assert re.search(r" while .*: [0-9.]+ m \([0-9.]+ sigma\), references", done.out), done.out
     assert "Push the robot ten turns" in " ".join(done.out.split())
     assert f"--vehicle {tmp_path / 'corrected.yaml'}" in " ".join(done.out.split())
