@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import deque
 
 import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.robot import SKIDDING, SensorNumbers
-from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
     COURSE_LAG,
-    GNSS_DELAY,
     GYRO_BIAS,
-    IMITATED,
     NUMBERS,
     TURN_SCALE,
     WHEEL_SCALE,
@@ -27,20 +23,17 @@ from terrafusion.fusion.calibration.numbers import (
     known_before,
 )
 from terrafusion.fusion.calibration.online import SelfCalibration
-from terrafusion.fusion.calibration.place_belief import (
-    PLACE,
-    REFUTED_SIGMA,
-    TIMELY_SIGMA_S,
-    PlaceBelief,
-    unrefuted,
-)
+from terrafusion.fusion.calibration.place_belief import PlaceBelief
 from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimator.alignment import Start
+from terrafusion.fusion.estimator.before_skid import KnownBeforeSkid
+from terrafusion.fusion.estimator.correction_rule import CORRECTED, CorrectionRule, wheels_roll
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
 from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
+from terrafusion.fusion.estimator.turn_doubt import with_turn_doubt
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.kept import Kept
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, KeyState
@@ -59,33 +52,8 @@ LEAST_SLIP_SIGMA = 0.02
 """Least sigma of learned slip: the next ground may be another one (assumed)."""
 GYRO_DENSITY_RADPS, WHEEL_TURN_SHARE = 3e-3, 0.1
 """Noise of the turn over seconds, beyond what a bias explains (assumed)."""
-TURN_TIME_S = 10.0
-"""Duration of a turn in one direction, over which a wrong scale adds up without fixes (assumed)."""
-
-
 ANTENNA_STATES = [NAV.stop + LINEAR.index(name) for name in ("antenna_x_m", "antenna_y_m")]
 """Of `--calibrate`, in a keyframe."""
-CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
-"""Numbers that correct a sensor; the others only describe its noise or belong to another state."""
-LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
-"""Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
-rotation look alike (assumed)."""
-SLIP_IMITATES = np.array([0.0, 0.0, *IMITATED[[ANTENNA_Y, GNSS_DELAY]]])
-"""What wheels that skid make of a drive, for residuals with the variance of their noise and as much again; a
-correction is twice that. The place ahead is seen in every turn."""
-MOST_SPREAD = 0.1
-"""Spread of slip beyond which the wheels do not roll, and a skid looks like a delay (assumed)."""
-SKID_DETECTION_NS, STEPS_KEPT = 15_000_000_000, 8
-"""A skid shows within this time (assumed); so many steps of learning reach further back."""
-LEAST_LATE_S, LEAST_LATE_TURNING_S, TURNING_RAD, MOST_MISFIT = 0.3, 0.15, 3.0, 10.0
-"""Fixes later than the first (wheels that spin look less late), or than the second where the robot turned by
-so much, another antenna or another gyro can look like a skid; they explain it if the fixes then lie within
-about three of their sigma: a skid leaves a hundred and more (assumed)."""
-UNMODELLED_SIGMA = np.array([0.0, 0.03, 0.03, TIMELY_SIGMA_S])
-"""1 sigma of what slip adds to these numbers on any ground (turn share, m, m, s; assumed)."""
-CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 4.0]), 0.5
-"""A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
-the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,11 +84,9 @@ class LearnedNumbers:
         self.mounting = ImuMounting(config, imu, gnss.skid)
         self._spec = config.rig.sensors.imu
         self._bias_radps = float(prior.mean[GYRO_BIAS])
-        self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         self._known, self._skids = prior, config.rig.drive in SKIDDING
+        self._rule, self._before_skid = CorrectionRule(prior, self._skids), KnownBeforeSkid()
         self._place, self._moments = Kept[PlaceBelief](), Kept[Array]()
-        self._before_skid: Knowledge | None = None
-        self._past = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
         if known != SensorNumbers():
             self._apply(prior, 0, known.wheel_scale is not None)
 
@@ -128,7 +94,7 @@ class LearnedNumbers:
         """Begin with what earlier runs of the robot gave."""
         if self.calibration is not None:
             self.calibration.start_from(prior)
-            self._before = self._known = prior
+            self._known, self._rule = prior, CorrectionRule(prior, self._skids)
             self._bias_radps = float(prior.mean[GYRO_BIAS])
             self._apply(prior, 0)
 
@@ -137,7 +103,7 @@ class LearnedNumbers:
         runs where the robot did not stand to show it, and how well the antenna's place is known.
         """
         known = sigmas.copy()
-        known[ANTENNA_STATES] = self._before.sigma[[ANTENNA_X, ANTENNA_Y]]
+        known[ANTENNA_STATES] = self._rule.before.sigma[[ANTENNA_X, ANTENNA_Y]]
         if start.gyro_bias_radps is not None or self._bias_radps == 0.0:
             return point, known
         gyro = np.array([0.0, 0.0, self._bias_radps])
@@ -183,7 +149,7 @@ class LearnedNumbers:
             return
         skid = self._gnss.skid
         if skid.friction is not None and skid.friction.leads:
-            self._forget(self._before_skid or self._untouched(chain, learning))
+            self._forget(self._before_skid.held or self._untouched(chain, learning))
             return
         self._handle_skid(chain, learning, skid.rate_m2ps > 0.0)
         pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
@@ -197,10 +163,10 @@ class LearnedNumbers:
         learning = self.calibration
         if learning is None or not learning.advance():
             return
-        if self._before_skid is not None and not self._explained(learning):
+        if self._before_skid.held is not None and not self._explained(learning):
             return
         self._known, t_ns, gnss = learning.known, chain.nodes[-1].t_ns, self._gnss
-        self._past.append((t_ns, self._known))
+        self._before_skid.learned(t_ns, self._known)
         antenna_m, delay_s = gnss.antenna_m, gnss.delay_s
         self._apply(self._known, t_ns)
         speed_mps = float(np.linalg.norm(chain.state(chain.last).velocity))
@@ -210,8 +176,7 @@ class LearnedNumbers:
 
     def course_lag_s(self) -> tuple[float, float]:
         """Time by which the course follows the heading, and its 1 sigma on other grounds; see `numbers`."""
-        rolls = self._known.slip_spread < MOST_SPREAD
-        learned_s = float(self._known.mean[COURSE_LAG]) if rolls else 0.0
+        learned_s = float(self._known.mean[COURSE_LAG]) if wheels_roll(self._known) else 0.0
         return learned_s, GROUND_LAG_SIGMA_S if self._skids else 0.0
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
@@ -250,8 +215,10 @@ class LearnedNumbers:
         """Moments (..., 4) about corrections (..., 3) of antenna and delay."""
         if self.calibration is None:
             return np.zeros((*used.shape[:-1], 4))
-        corrected = self._clear[[CORRECTED.index(number) for number in PLACE]]
-        place = self._place.of((self._known,), lambda: PlaceBelief.of(self._known, self._before, corrected))
+        rule = self._rule
+        place = self._place.of(
+            (self._known,), lambda: PlaceBelief.of(self._known, rule.before, rule.clear_places)
+        )
         lag_s, lag_sigma_s = self._known.mean[COURSE_LAG], self._known.sigma[COURSE_LAG]
         lag_s2 = (lag_s - self.course_lag_s()[0]) ** 2 + lag_sigma_s**2
         return np.concatenate([place.moments(used), np.full((*used.shape[:-1], 1), lag_s2)], axis=-1)
@@ -261,20 +228,12 @@ class LearnedNumbers:
         numbers = frozenset(number.state for number in self.table() if number.corrects)
         mounting, places = self.mounting, self._gnss.antenna_places
         sigma_rad = mounting.known.sigma_rad if mounting.learns else None
-        since_ns, delay_s = mounting.corrects_since_ns, self._uncorrected_delay_s()
-        return Corrections(numbers, since_ns, sigma_rad, places, delay_s)
-
-    def _uncorrected_delay_s(self) -> tuple[float, float] | None:
-        if self.calibration is None or self._clear[CORRECTED.index(GNSS_DELAY)]:
-            return None
-        known, at = self._known, CORRECTED.index(GNSS_DELAY)
-        delay_s = known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY]
-        slip_s = math.sqrt(known.misfit - 1.0) * SLIP_IMITATES[at] if self._skids else 0.0
-        return float(delay_s), math.hypot(float(known.sigma[GNSS_DELAY]), slip_s)
+        delay_s = None if self.calibration is None else self._rule.uncorrected_delay_s(self._known)
+        return Corrections(numbers, mounting.corrects_since_ns, sigma_rad, places, delay_s)
 
     def _of_fixes(self, prior: Knowledge) -> list[NumberAfterDrive]:
         mean, sigma = self._known.mean.tolist(), self._known.stated_sigma(prior).tolist()
-        corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))
+        corrects = dict(zip(CORRECTED, self._rule.clear.tolist(), strict=True))
         return [
             NumberAfterDrive(name, mean[i], sigma[i], float(prior.sigma[i]), corrects.get(i, False))
             for i, name in enumerate(NUMBERS)
@@ -286,31 +245,23 @@ class LearnedNumbers:
 
         Where other numbers explain it, learning goes on; after a skid it begins again.
         """
-        if skids and self._before_skid is None:
-            self._before_skid = self._untouched(chain, learning)
-        elif not skids and self._before_skid is not None:
+        before = self._before_skid
+        if skids and before.held is None:
+            before.held = self._untouched(chain, learning)
+        elif not skids and before.held is not None:
             if not self._explained(learning):
-                self._forget(self._before_skid)
-            self._before_skid = None
+                self._forget(before.held)
+            before.held = None
 
     def _untouched(self, chain: Chain, learning: SelfCalibration) -> Knowledge:
-        """What was known before a skid that shows now began."""
-        until_ns = chain.nodes[-1].t_ns - SKID_DETECTION_NS
-        return next((known for t_ns, known in reversed(self._past) if t_ns <= until_ns), learning.before)
+        return self._before_skid.at(chain.nodes[-1].t_ns, learning.before)
 
     def _explained(self, learning: SelfCalibration) -> bool:
-        """Whether other numbers of a robot with rolling wheels explain a drive that looks like a skid."""
-        known = learning.known
-        if known.misfit > MOST_MISFIT or known.slip_spread > MOST_SPREAD:
-            return False
-        least = np.maximum(REFUTED_SIGMA * known.sigma[CORRECTED], LEAST_CORRECTION)
-        turning = learning.turned_rad > TURNING_RAD
-        least[CORRECTED.index(GNSS_DELAY)] = LEAST_LATE_TURNING_S if turning else LEAST_LATE_S
-        return bool((np.abs(known.mean - self._before.mean)[CORRECTED] > least).any())
+        return self._rule.explains_skid(learning.known, learning.turned_rad)
 
     def _forget(self, known: Knowledge) -> None:
-        self._before_skid, self._known = None, known
-        self._past.clear()
+        self._known = known
+        self._before_skid.clear()
         if self.calibration is not None:
             self.calibration.restart(known)
 
@@ -332,7 +283,7 @@ class LearnedNumbers:
         return with_turn_doubt(noise, doubt, segments, self._spec, unaided_s)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
-        turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()
+        turn_scale, x_m, y_m, delay_s = self._rule.corrections(known).tolist()
         self._imu.turn_scale = turn_scale
         self._gnss.correct(t_ns, np.array([x_m, y_m]), delay_s)
         if not slip:
@@ -340,25 +291,6 @@ class LearnedNumbers:
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
         mean, time_s = -float(known.mean[WHEEL_SCALE]), known.slip_time_s / SLIP_STEADY
         self._weights.learn_slip(mean, max(doubt, LEAST_SLIP_SIGMA), time_s, t_ns)
-
-    def _corrections(self, known: Knowledge) -> Array:
-        """The numbers (4,) of `CORRECTED`: as known before, but where the drive clearly shows others.
-
-        At one speed an antenna further ahead and fixes that come earlier look alike: what is shown
-        is conditional on those numbers being as before that the drive does not refute.
-        """
-        off, sigma = known.mean - self._before.mean, known.sigma
-        corrected, size = self._before.mean[CORRECTED], np.abs(off[CORRECTED])
-        limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
-        limit = limit * np.hypot(sigma[CORRECTED], UNMODELLED_SIGMA)
-        rolling = known.slip_spread < MOST_SPREAD
-        least = LEAST_CORRECTION
-        if self._skids:
-            least = np.maximum(least, 2.0 * math.sqrt(known.misfit - 1.0) * SLIP_IMITATES)
-        self._clear = clear = (size > limit) & (size > least) & rolling
-        shown = [i for i, is_clear in zip(CORRECTED, clear.tolist(), strict=True) if is_clear]
-        corrected[clear], _ = known.given(shown, unrefuted(known, self._before, shown), self._before)
-        return corrected
 
 
 def _doubt_place(chain: Chain, moved_m: float) -> None:
@@ -391,21 +323,3 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
     )
     antenna_m = complex(*sensors.gnss.antenna_m[:2]) + config.rig.ahead_m
     return SelfCalibration(prior, noise, antenna_m)
-
-
-def with_turn_doubt(
-    noise: SensorNoise, doubt: float, segments: list[ImuSegment], imu: ImuSpec, unaided_s: float
-) -> SensorNoise:
-    """Noise of a keyframe's yaw rate with the `doubt` of its scale, 1 sigma, `unaided_s` after the last fix.
-
-    In a steady turn at rate w an error s of the scale turns the heading by s w t; white noise of density
-    sqrt(2 t) s w gives the same variance at every t.
-    """
-    total = sum([s.dt_s for s in segments])
-    turn = sum([float(s.gyro_radps[2]) * s.dt_s for s in segments])
-    rate = abs(turn) / total if total > 0.0 else 0.0
-    grown = math.sqrt(min(2.0 * unaided_s, TURN_TIME_S))
-    more = doubt * rate * grown / imu.gyro_noise_radps_sqrthz
-    if more < 0.1 * noise.gyro_yaw_inflation:
-        return noise
-    return dataclasses.replace(noise, gyro_yaw_inflation=math.hypot(noise.gyro_yaw_inflation, more))

@@ -23,13 +23,10 @@ from terrafusion.fusion.calibration.numbers import (
     assumed,
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.before_skid import SKID_DETECTION_NS, KnownBeforeSkid
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.learned_numbers import (
-    SKID_DETECTION_NS,
-    TURN_TIME_S,
-    _doubt_place,
-    with_turn_doubt,
-)
+from terrafusion.fusion.estimator.learned_numbers import _doubt_place
+from terrafusion.fusion.estimator.turn_doubt import TURN_TIME_S, with_turn_doubt
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
@@ -157,7 +154,8 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
     assert learned.calibration is not None
     assert learned._untouched(driving.chain, learned.calibration) is learned.calibration.before
     sure, late = (dataclasses.replace(learned.calibration.before, slip_spread=s) for s in (0.01, 0.02))
-    learned._past.extend([(now_ns - SKID_DETECTION_NS, sure), (now_ns, late)])
+    for t_ns, known in ((now_ns - SKID_DETECTION_NS, sure), (now_ns, late)):
+        learned._before_skid.learned(t_ns, known)
     assert learned._untouched(driving.chain, learned.calibration) is sure
 
 
@@ -168,11 +166,12 @@ def test_learning_begins_again_from_what_was_known_before_a_wrong_heading(
     assert learned.calibration is not None
     monkeypatch.setattr(learned.calibration, "restart", begun.append)
     monkeypatch.setattr(learned, "_known", dataclasses.replace(learned._known, slip_spread=0.3))
-    monkeypatch.setattr(learned, "_past", learned._past.copy())
+    monkeypatch.setattr(learned, "_before_skid", KnownBeforeSkid())
+    learned._before_skid.learned(0, learned._known)
     learned.heading_turned()
     assert begun == [learned.calibration.before]
     assert learned._known is learned.calibration.before
-    assert not learned._past
+    assert learned._before_skid.at(2 * SKID_DETECTION_NS, learned.calibration.before) is begun[0]
 
 
 def test_the_height_of_a_fix_says_nothing_of_its_place(
@@ -189,11 +188,11 @@ def test_the_height_of_a_fix_says_nothing_of_its_place(
 def test_numbers_known_before_the_drive_explain_no_slide(
     driving: Estimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learned, mean = driving.learned, driving.learned._before.mean.copy()
+    learned, mean = driving.learned, driving.learned._rule.before.mean.copy()
     mean[ANTENNA_X] += 0.5
     known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), 0.03, 300.0, misfit=2.0)
     assert learned.calibration is not None
-    for holder, name in ((learned, "_before"), (learned.calibration, "known")):
+    for holder, name in ((learned._rule, "before"), (learned.calibration, "known")):
         monkeypatch.setattr(holder, name, known)
     assert not learned._explained(learned.calibration)
 
@@ -216,7 +215,7 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
     driving: Estimator, number: int, off: float, misfit: float, turned_rad: float, explained: bool
 ) -> None:
     """A slide takes back what was learned, numbers of a robot with rolling wheels do not."""
-    learned, before = driving.learned, driving.learned._before
+    learned, before = driving.learned, driving.learned._rule.before
     mean = before.mean.copy()
     mean[number] += off
     learning = driving.learned.calibration
@@ -234,7 +233,7 @@ def test_numbers_that_the_drive_shows_explain_what_looks_like_a_slide(
 def test_the_course_of_wheels_that_slip_is_not_taken_to_lag(
     driving: Estimator, monkeypatch: pytest.MonkeyPatch, lag_s: float, spread: float, taken_s: float
 ) -> None:
-    mean = driving.learned._before.mean.copy()
+    mean = driving.learned._rule.before.mean.copy()
     mean[COURSE_LAG] = lag_s
     known = Knowledge(mean, 1e-6 * np.eye(len(NUMBERS)), spread, 300.0)
     monkeypatch.setattr(driving.learned, "_known", known)
@@ -258,7 +257,7 @@ def test_a_course_lag_is_doubted_by_its_sigma_and_by_what_is_not_corrected(
     spread: float, off_s: float
 ) -> None:
     learned = Estimator.for_vehicle("husky").learned
-    mean, covariance = learned._before.mean.copy(), learned._before.covariance
+    mean, covariance = learned._rule.before.mean.copy(), learned._rule.before.covariance
     mean[COURSE_LAG] = 0.2
     learned._known = Knowledge(mean, covariance, spread, 300.0)
     assert np.sqrt(learned.place_moments()[-1]) == pytest.approx(np.hypot(SKIDDING_LAG_SIGMA_S, off_s))
