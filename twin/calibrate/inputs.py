@@ -32,13 +32,25 @@ def check_source(source: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
+class Commanded:
+    """Twists (N + 1, 2) commanded every `DT_S`, before the limits, and the one (2,) to start from."""
+
+    twist: Array
+    start: Array
+
+    def sides(self, vehicle: VehicleParams) -> Array:
+        """Wheel speeds (N + 1, 2) within the vehicle's limits, rad/s."""
+        return side_speeds(limit_slew(self.twist, DT_S, vehicle, self.start), vehicle)
+
+
+@dataclass(frozen=True, eq=False)
 class TwinInput:
     """The twin's input.
 
     Attributes:
         start_ns: time of the first sample.
         sides: (N + 1, 2) wheel speeds of left and right, rad/s, every `DT_S`, before any dead time.
-        follows: whether they are measured speeds that the wheels follow, not commands.
+        commanded: what they follow from; None for measured speeds, which the wheels follow.
         gaps: (G, 2) stretches without input, s.
         notes: what was assumed.
         step_s: time between two commands; 0 for measured speeds.
@@ -46,7 +58,7 @@ class TwinInput:
 
     start_ns: int
     sides: Array
-    follows: bool
+    commanded: Commanded | None
     gaps: Array
     notes: tuple[str, ...]
     step_s: float = 0.0
@@ -97,7 +109,7 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     centre = t_s - 0.5 * min(sample_interval_s(t_s), 0.1)
     grid = DT_S * np.arange(round(float(t_s[-1]) / DT_S) + 1)
     sides = np.stack([np.interp(grid, centre, side) for side in measured.T], axis=1)
-    return TwinInput(start, sides, True, _gaps(t_s), tuple(notes))
+    return TwinInput(start, sides, None, _gaps(t_s), tuple(notes))
 
 
 def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
@@ -128,15 +140,15 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     grid: Array = DT_S * np.arange(float(count))
     limits = np.array([vehicle.drive.max_accel_mps2, vehicle.drive.max_yaw_accel_radps2])
     wanted = np.stack([_between(t_s, twist[:, i], grid, limits[i]) for i in range(2)], axis=1)
-    first = np.zeros(2) if _rests(recording, vehicle) else wanted[0]
-    sides = side_speeds(limit_slew(wanted, DT_S, vehicle, first), vehicle)
+    commanded = Commanded(wanted, np.zeros(2) if _rests(recording, vehicle) else wanted[0])
     # Rare commands hold until the next one.
     gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
     notes = [
         f"the commands have {counted(len(gaps), 'gap')} of up to {np.diff(gaps).max():.1f} s, in which "
         "nothing is compared and the last command is held"
     ] if len(gaps) else []  # fmt: skip
-    return TwinInput(start, sides, False, gaps, tuple(notes), min(sample_interval_s(t_s), LONGEST_GAP_S))
+    step_s = min(sample_interval_s(t_s), LONGEST_GAP_S)
+    return TwinInput(start, commanded.sides(vehicle), commanded, gaps, tuple(notes), step_s)
 
 
 def _gaps(t_s: Array) -> Array:

@@ -3,9 +3,11 @@
 The start pose of a window is a guess from dead reckoning aligned to the positions of the log.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +15,11 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, twin_input
+from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, Commanded, twin_input
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed, observe
 from terrafusion.twin.model.motion import plane_rotation
+from terrafusion.twin.model.vehicle import VehicleParams
 
 START_S = 1.0
 """The first second of a log that starts on the move, or of the motion on a slope, is not compared: how soil,
@@ -44,6 +47,7 @@ class PreparedLog:
         notes: what was assumed, in sentences.
         input_step_s: time between two commands, between which a change may lie anywhere; 0 where the wheels
             are followed.
+        commanded: what `sides` come from; None for measured speeds and simulated drives.
     """
 
     name: str
@@ -57,6 +61,13 @@ class PreparedLog:
     posed: bool
     notes: tuple[str, ...]
     input_step_s: float = 0.0
+    commanded: Commanded | None = None
+
+    def driven_by(self, vehicle: VehicleParams) -> Self:
+        """The log with the commands within the limits of a twin."""
+        if self.commanded is None:
+            return self
+        return dataclasses.replace(self, sides=self.commanded.sides(vehicle))
 
     def seconds(self) -> float:
         """Length of what is compared, s."""
@@ -94,7 +105,9 @@ def prepare(
     """
     given = twin_input(recording, model.vehicle, source)
     notes = list(given.notes)
-    observed = observe(recording, model.vehicle, given.start_ns, wheels=not given.follows, truth=truth)
+    observed = observe(
+        recording, model.vehicle, given.start_ns, wheels=given.commanded is not None, truth=truth
+    )
     if channels is not None:
         observed = tuple(o for o in observed if o.channel.startswith(channels))
     ends = [float(o.end_s[-1]) for o in observed]
@@ -117,8 +130,8 @@ def prepare(
     if model.slope_rad > 0.0 and not posed:
         notes.append("on a slope, and nothing in the log determines the heading: taken as 0 at the start")
     return PreparedLog(
-        recording.name, given.sides, given.follows, labels, borders, windows, start, observed, posed,
-        tuple(notes), given.step_s,
+        recording.name, given.sides, given.commanded is None, labels, borders, windows, start, observed,
+        posed, tuple(notes), given.step_s, given.commanded,
     )  # fmt: skip
 
 

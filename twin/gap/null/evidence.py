@@ -16,7 +16,7 @@ from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
-from terrafusion.twin.gap.null.reference_twin import all_residuals, set_to_references
+from terrafusion.twin.gap.null.reference_twin import all_residuals, differences, set_to_references
 from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
 from terrafusion.twin.gap.rollout.residuals import (
@@ -88,7 +88,9 @@ def gather_evidence(
     channels = tuple(o.channel for o in logs[0].observed)
     known = {} if cache is None else cache
     if references:
+        given = model
         model = set_to_references(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
+        logs, notes = [log.driven_by(model.vehicle) for log in logs], [*notes, *differences(given, model)]
     candidates = candidates.beside(model.effects)
     linearised, done = LinearisationCache(model, candidates, known), itertools.count(1)
 

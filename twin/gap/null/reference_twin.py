@@ -1,12 +1,13 @@
 """Sets the twin to the robot that the reference runs show.
 
-How all laws act depends on the ground and on how stiffly the motors follow, which owners hardly know. Effects
-are changes of a twin that drives as the references do: such numbers are fitted to them by damped Gauss-Newton
-steps (Marquardt 1963), from the best of a few starts.
+How all laws act depends on the ground and on how the motors follow their commands, which owners hardly know.
+Effects are changes of a twin that drives as the references do: such numbers are fitted to them by damped
+Gauss-Newton steps (Marquardt 1963), from the best of a few starts.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.config import quantities
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
@@ -35,6 +37,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predictions
 from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise
+from terrafusion.twin.model.vehicle import VehicleParams
 
 RUNS = 3  # references that are used
 NUMBERS = (
@@ -42,15 +45,26 @@ NUMBERS = (
     "soil.resistance.rolling", "vehicle.drive.speed_loop_p_nms", "vehicle.drive.speed_loop_i_nm",
 )  # fmt: skip
 """What is fitted: strength of the ground, and how soft and how sticky it is; gains of the speed loop."""
-STARTS = {"shear_modulus_m": -3.0, "speed_loop_p_nms": 2.7, "speed_loop_i_nm": -6.0}
+LIMITS, DEAD_TIME = ("vehicle.drive.max_accel_mps2", "vehicle.drive.max_yaw_accel_radps2"), "dead_time_s"
+"""Fitted, too, where commands drive the twin: within which limits the robot follows them, and how late."""
+LIMIT_SCALE, DEAD_TIME_SCALE_S = 0.5, 0.05  # of a limit's logarithm, and of the dead time (assumed)
+TOLD = 0.5  # share of a scale by which a number differs that is told
+BASE = "vehicle.body.wheelbase_m"
+"""Fitted for a robot of two driven wheels, whose casters do not scrub, where nobody measured it."""
+STARTS = {"shear_modulus_m": -3.0, "speed_loop_p_nms": 2.7, "speed_loop_i_nm": -6.0, "wheelbase_m": -4.0}
 """Where the search may begin instead, in scales: ground without give, motors that follow stiffly, and ones
 without an integral. From too soft a loop it would end in a minimum with too large an integral."""
+LATER = (
+    {"dead_time_s": 1.0}, {"dead_time_s": 1.0, "max_accel_mps2": -1.0, "max_yaw_accel_radps2": -1.0}
+)  # fmt: skip
+"""Where another search begins: robots that follow their commands later, and more slowly as well."""
 SIGMA = 2.0  # 1 sigma of a number, in scales of `Coordinate` (assumed)
 EFFECT_SIGMA = 0.1
 """1 sigma of effects beside, in typical sizes (assumed): the numbers explain what they can."""
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
-STEPS, TRIES, ENOUGH = 6, 4, 0.01
-"""Most steps of the search, tries of each, and the gain, as a share, below which one is the last."""
+FIRST_STEPS, STEPS, TRIES, ENOUGH = 3, 8, 4, 0.01
+"""Most steps of each first search, of the one that begins again with the noise learnt there, tries of each,
+and the gain, as a share, below which one is the last."""
 MOST_STEPS = 4
 """Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not
 tried: logs hardly tell them from softer ones, and all rollouts would take longer."""
@@ -79,6 +93,18 @@ def all_residuals(
 
 
 @dataclass(frozen=True, eq=False)
+class _Found:
+    """Where a search is: numbers w (K,), errors (n,) of the runs (None where the twin diverges), cost and
+    damping; `done` where it ends."""
+
+    w: Array
+    errors: list[Array] | None
+    cost: float
+    damping: float = DAMPING
+    done: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class _Fit:
     """The fit of numbers w (K,), in scales, to runs about the given model."""
 
@@ -93,6 +119,10 @@ class _Fit:
             {c.name: c.value(float(x)) for c, x in zip(self.numbers, w, strict=True)}
         )
 
+    def rollouts(self, model: Model) -> list[Rollout]:
+        """The runs by a model, within its limits."""
+        return [Rollout(r.log.driven_by(model.vehicle), {}, model=model) for r in self.runs]
+
     def steps(self, model: Model) -> int:
         """Integration steps a sample that a twin needs."""
         return stable_steps(DT_S, plant_of(self.runs[0].log, model), INTEGRATOR_ORDER)
@@ -103,7 +133,7 @@ class _Fit:
         models, count = [self.model(w) for w in points], len(self.runs)
         most = max(MOST_STEPS, self.steps(self.cache.model))
         soft = [self.steps(model) <= most for model in models]
-        tried = [Rollout(r.log, {}, model=m) for m in itertools.compress(models, soft) for r in self.runs]
+        tried = [rollout for m in itertools.compress(models, soft) for rollout in self.rollouts(m)]
         found = iter(aligned_predictions(tried, self.cache.model, self.cache.candidates, self.jobs))
         out = list[list[Array] | None]()
         for near in soft:
@@ -130,38 +160,51 @@ class _Fit:
             return np.inf
         return float(self.inner([e[:, None] for e in errors])[0, 0] + np.square(w / SIGMA).sum())
 
-    def solve(self) -> Array:
-        """The numbers that fit best."""
-        w, errors, cost = self._start()
-        damping = DAMPING
-        for _ in range(STEPS):
-            if errors is None:
-                break
-            H, gradient = self._normal(w, errors)
-            for _ in range(TRIES):
-                step = np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
-                tried = w + np.clip(step, -LONGEST, LONGEST)
-                (after,) = self.errors([tried])
-                now = self.cost(tried, after)
-                if now < cost:
-                    break
-                damping *= MORE
-            else:
-                break
-            gain, damping = 1.0 - now / cost, damping * LESS
-            w, errors, cost = tried, after, now
-            if gain < ENOUGH:
-                break
-        return w
+    def solve(self, again: bool) -> Array:
+        """The numbers that fit best; the search begins at the model itself, if `again`, or at the best of the
+        starts."""
+        if again:
+            w = np.zeros(len(self.numbers))
+            (errors,) = self.errors([w])
+            return self._search(_Found(w, errors, self.cost(w, errors)), STEPS).w
+        first = [self._search(start, FIRST_STEPS) for start in self._starts()]
+        return self._search(min(first, key=lambda found: found.cost), FIRST_STEPS).w
 
-    def _start(self) -> tuple[Array, list[Array] | None, float]:
-        """The best of the starts, with its errors and cost."""
-        others = [STARTS.get(c.name.rpartition(".")[2]) for c in self.numbers]
-        points = [np.array(p) for p in itertools.product(*((0.0, x) if x else (0.0,) for x in others))]
-        errors = self.errors(points)
-        costs = [self.cost(w, e) for w, e in zip(points, errors, strict=True)]
-        best = int(np.argmin(costs))
-        return points[best], errors[best], costs[best]
+    def _search(self, at: _Found, steps: int) -> _Found:
+        """At most so many steps from a start."""
+        for _ in range(steps):
+            if at.errors is None or at.done:
+                break
+            at = self._step(at, at.errors)
+        return at
+
+    def _step(self, at: _Found, errors: Sequence[Array]) -> _Found:
+        H, gradient = self._normal(at.w, errors)
+        damping = at.damping
+        for _ in range(TRIES):
+            step = np.linalg.solve(H + damping * np.diag(np.diag(H)), gradient)
+            w = at.w + np.clip(step, -LONGEST, LONGEST)
+            (after,) = self.errors([w])
+            cost = self.cost(w, after)
+            if cost < at.cost:
+                return _Found(w, after, cost, damping * LESS, 1.0 - cost / at.cost < ENOUGH)
+            damping *= MORE
+        return dataclasses.replace(at, done=True)
+
+    def _starts(self) -> list[_Found]:
+        """The best start that follows its commands as given, and the best of those that are later."""
+        names = [c.name.rpartition(".")[2] for c in self.numbers]
+        others = [(0.0, STARTS[name]) if name in STARTS else (0.0,) for name in names]
+        near = [np.array(p) for p in itertools.product(*others)]
+        groups = [near]
+        if late := [np.array([own.get(name, 0.0) for name in names]) for own in LATER if {*own} <= {*names}]:
+            groups.append([p + path for path in late for p in near])
+        errors = iter(self.errors([p for group in groups for p in group]))
+        out = []
+        for group in groups:
+            found = [_Found(w, e, self.cost(w, e)) for w, e in zip(group, errors, strict=False)]
+            out.append(min(found, key=lambda f: f.cost))
+        return out
 
     def _normal(self, w: Array, errors: Sequence[Array]) -> tuple[Array, Array]:
         """Information (K, K) on the numbers and gradient (K,) of the fit; none where the twin diverges."""
@@ -177,11 +220,46 @@ class _Fit:
 def set_to_references(
     logs: Sequence[PreparedLog], cache: LinearisationCache, channels: Sequence[str], jobs: int
 ) -> Model:
-    """The twin of the cache with the numbers that fit the references; those that are zero stay so."""
-    runs = all_residuals(logs[:RUNS], cache, channels, jobs)
-    noise = learn_noise(runs, [], cache.candidates, jobs)
-    keys = {f"effects.{key}" for key in cache.candidates.keys}
+    """The twin of the cache with the numbers that fit the references; those that are zero stay so.
+
+    The noise of a twin that is wrong holds its errors: it is learnt once more about the first fit.
+    """
+    for again in (False, True):
+        runs = all_residuals(logs[:RUNS], cache, channels, jobs)
+        noise = learn_noise(runs, [], cache.candidates, jobs)
+        numbers = _numbers(cache, commanded=any(run.log.commanded for run in runs))
+        fit = _Fit(cache, noise, numbers, [whitened(run.without_nuisance(), noise) for run in runs], jobs)
+        model = fit.model(fit.solve(again))
+        logs, cache = [log.driven_by(model.vehicle) for log in logs], dataclasses.replace(cache, model=model)
+    return model
+
+
+def _numbers(cache: LinearisationCache, commanded: bool) -> list[Coordinate]:
+    """What is fitted, as the solver sees it."""
+    keys, vehicle = {f"effects.{key}" for key in cache.candidates.keys}, cache.model.vehicle
     names = [name for name in NUMBERS if name in keys or not name.startswith("effects.")]
-    numbers = [c for c in coordinates_of(names, cache.model, {}) if c.logarithmic or c.name in keys]
-    fit = _Fit(cache, noise, numbers, [whitened(run.without_nuisance(), noise) for run in runs], jobs)
-    return fit.model(fit.solve())
+    if vehicle.drive.type == "differential" and BASE.partition(".")[2] not in vehicle.measured:
+        names.append(BASE)
+    found = [c for c in coordinates_of(names, cache.model, {}) if c.logarithmic or c.name in keys]
+    return found + (_limits(cache.model) if commanded else [])
+
+
+def _limits(model: Model) -> list[Coordinate]:
+    """How the robot follows its commands, as numbers of the fit."""
+    ranges, out = quantities(VehicleParams), list[Coordinate]()
+    for name in (*LIMITS, f"vehicle.drive.{DEAD_TIME}"):
+        q, now, is_limit = ranges[name.removeprefix("vehicle.")], model.value(name), name in LIMITS
+        scale = LIMIT_SCALE if is_limit else DEAD_TIME_SCALE_S
+        out.append(Coordinate(name, q.unit, q.low, q.high, now, scale, is_limit, now))
+    return out
+
+
+def differences(given: Model, shown: Model) -> list[str]:
+    """What the references show of the robot against the vehicle's file, in a sentence where it differs."""
+    parts = []
+    for name in (*LIMITS, f"vehicle.drive.{DEAD_TIME}", BASE):
+        before, now = given.value(name), shown.value(name)
+        apart = DEAD_TIME_SCALE_S if DEAD_TIME in name else LIMIT_SCALE * before
+        if abs(now - before) > TOLD * apart:
+            parts.append(f"{name.removeprefix('vehicle.')} {now:.2g} (file: {before:.2g})")
+    return [f"the twin is set to what the references show: {', '.join(parts)}"] if parts else []

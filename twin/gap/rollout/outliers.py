@@ -23,7 +23,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 HEAVY_TAILED = 0.02
 """A channel is clipped where more than this share (assumed) of the references' errors exceeds the limit."""
 CHANGED = 1.5
-"""Where half of the judged runs' errors exceed the noise by this factor (assumed), the runs have changed:
+"""Where the judged runs' usual error exceeds the references' by this factor (assumed), the runs have changed:
 their limit is in their own sigmas."""
 NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation of normal errors
 
@@ -45,12 +45,15 @@ def limit_outliers(
         group = zip(every[some], fits[some], strict=True)
         return np.abs(np.concatenate([error[run.channel == channel] for run, (_, error) in group]))
 
-    heavy = [float(np.mean(errors(slice(N, None), i) > OUTLIER_SIGMAS)) > HEAVY_TAILED for i in channels]
-    own = [NORMAL_MAD * float(np.median(errors(slice(N), i))) for i in channels]
-    normal = np.where(heavy, OUTLIER_SIGMAS, np.inf)
-    changed = np.where(np.array(own) > CHANGED, own, 1.0) * normal
+    judged, normal = ([errors(some, i) for i in channels] for some in (slice(N), slice(N, None)))
+    own, usual = (NORMAL_MAD * np.array([np.median(e) for e in some]) for some in (judged, normal))
+    usual = np.maximum(usual, 1.0)  # where the twin is wrong, references err by more than their noise
+    limit = OUTLIER_SIGMAS * usual
+    heavy = [float(np.mean(e > most)) > HEAVY_TAILED for e, most in zip(normal, limit, strict=True)]
+    limit[~np.array(heavy, dtype=bool)] = np.inf
+    changed = np.where(own > CHANGED * usual, own / usual, 1.0) * limit
     clipped = [
-        _clipped(run, gain, changed if i < N else normal)
+        _clipped(run, gain, changed if i < N else limit)
         for i, (run, (gain, _)) in enumerate(zip(every, fits, strict=True))
     ]
     return clipped[:N], clipped[N:]

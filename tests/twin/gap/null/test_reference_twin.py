@@ -13,7 +13,7 @@ from terrafusion.twin.calibrate.start import coordinates_of
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.null.channel_noise import learn_noise
-from terrafusion.twin.gap.null.reference_twin import RUNS, _Fit, set_to_references
+from terrafusion.twin.gap.null.reference_twin import RUNS, _Fit, differences, set_to_references
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals, whitened
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
@@ -82,3 +82,41 @@ def test_ground_that_is_too_hard_for_the_steps_is_not_tried() -> None:
     found = fit.errors([soft, hard, soft])
     assert found[1] is None
     assert all(some is not None and len(some) == 1 for some in (found[0], found[2]))
+
+
+def test_how_the_robot_follows_its_commands_is_that_of_the_references() -> None:
+    """Limits of acceleration and a dead time that no owner has measured."""
+    known = load_vehicle("elevate")
+    own = {"max_accel_mps2": 0.7, "max_yaw_accel_radps2": 1.2, "dead_time_s": 0.06}
+    robot = dataclasses.replace(known, drive=dataclasses.replace(known.drive, **own))
+    runs = [
+        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
+        for k in range(RUNS)
+    ]
+    logs, model, _ = prepared(runs, known, "loose_sand")
+    channels = tuple(o.channel for o in logs[0].observed)
+    found = set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+    drive = found.vehicle.drive
+    assert drive.max_accel_mps2 == pytest.approx(0.7, rel=0.1)
+    assert drive.max_yaw_accel_radps2 == pytest.approx(1.2, rel=0.15)
+    assert drive.dead_time_s == pytest.approx(0.06, abs=0.03)
+    (told,) = differences(model, found)
+    assert "drive.max_accel_mps2 0.7" in told
+    assert "(file: 1.5)" in told
+    assert not differences(model, model)
+
+
+def test_the_base_of_two_driven_wheels_is_found_where_nobody_measured_it() -> None:
+    """Casters do not scrub: the robot turns as if all four wheels stood on one axle."""
+    known = load_vehicle("elevate")
+    drive = dataclasses.replace(known.drive, type="differential")
+    file = dataclasses.replace(known, drive=drive, measured=())
+    robot = dataclasses.replace(file, body=dataclasses.replace(file.body, wheelbase_m=0.1))
+    runs = [
+        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
+        for k in range(RUNS)
+    ]
+    logs, model, _ = prepared(runs, file, "loose_sand")
+    channels = tuple(o.channel for o in logs[0].observed)
+    found = set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+    assert found.vehicle.body.wheelbase_m < 0.6 * known.body.wheelbase_m
