@@ -13,7 +13,7 @@ and tables) with two functions, and list it in `formats.FORMATS`:
   docs/reference/conventions.md states, times in int64 ns. What was assumed or left out goes into
   `Recording.notes`, what is wrong with the file into a `DataError` with place, value and remedy, to which the
   caller adds the name of the file (`errors_of`, where there are several). A time that runs backwards is
-  refused unless `request.repair_clock` (`text.rows`). Bytes are of unknown origin: no count is believed
+  refused unless `request.repair_clock` (`timed_tables`). Bytes are of unknown origin: no count is believed
   before it was compared with what is there.
 - Optionally, for a folder, `member(path) -> Path | None`: a file in it that the catalogue may know it by.
 - Optionally `companions(path) -> Sequence[Path]`: the files that are read with this one.

@@ -4,19 +4,18 @@
 """
 
 import csv
-import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import Array, Mask, TimesNs, distinct
+from terrafusion.datasets.core.arrays import Array, Mask, distinct
 from terrafusion.datasets.core.channels import (
     Barometer,
     Channel,
@@ -41,8 +40,9 @@ from terrafusion.datasets.core.wrapped_angles import (
     unwrapped_alone,
     unwrapped_beside_speeds,
 )
-from terrafusion.datasets.readers.delimited import Columns, TextLayout, not_a_table, read_columns, read_text
+from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
 from terrafusion.datasets.readers.log_meta import Meta
+from terrafusion.datasets.readers.timed_tables import TimedTable
 
 MAX_T_S = 1e9
 """A |t_s| beyond this (32 years) is a Unix time, not seconds from the start."""
@@ -64,40 +64,13 @@ class ChannelColumns:
     required: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CsvTable(Columns):
-    """The rows of one CSV.
-
-    Attributes:
-        t_ns: (N,) int64, from the start of the recording, never decreasing unless asked for otherwise.
-        file: name of the file, for notes.
-        numbers: (N,) float columns by name; an empty cell is NaN.
-        texts: (N,) object columns by name; an empty cell is "".
-        notes: what was odd about the file, in sentences.
-    """
-
-    t_ns: TimesNs
-    file: str
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def select(self, rows: Any) -> Self:
-        """The rows of a boolean mask or index array."""
-        return dataclasses.replace(super().select(rows), t_ns=self.t_ns[rows])
-
-
-def read_table(path: Path, known: ChannelColumns, *, in_order: bool = True) -> CsvTable:
-    """Read one channel's `.csv` or `.csv.gz`.
-
-    Args:
-        path: the file; its first column set must hold `t_s`.
-        in_order: refuse times that run backwards.
+def read_table(path: Path, known: ChannelColumns) -> TimedTable:
+    """Read one channel's `.csv` or `.csv.gz`, which must have a column `t_s`.
 
     Raises:
         DataError: unreadable or empty file, unknown or repeated column, a cell that is not a
-            finite number, a line with too few or too many cells, a time that is missing, runs backwards
-            or looks like Unix time. The message names file, column, line and time.
+            finite number, a line with too few or too many cells, a time that is missing or looks like Unix
+            time. The message names file, column, line and time. Times are not checked for order.
     """
     with errors_of(path):
         data = read_text(path)
@@ -107,9 +80,11 @@ def read_table(path: Path, known: ChannelColumns, *, in_order: bool = True) -> C
         numbers = [name for name in header if name not in (*words, "t_s")]
         table = read_columns(path, data, layout, numbers, ["t_s", *words])
         t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
-        _check_times(t_ns, in_order=in_order)
-    texts = {name: table.texts[name] for name in words}
-    return CsvTable(t_ns=t_ns, numbers=table.numbers, texts=texts, file=path.name, notes=table.notes)
+        far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
+        if far.size:
+            what = f"t_s is {t_ns[far[0]] * 1e-9:.9g}, which looks like Unix time"
+            raise DataError(what, remedy="t_s must be seconds from start_ns of meta.yaml")
+    return TimedTable.of_text(table, words, t_ns, path)
 
 
 def _header(data: bytes, known: ChannelColumns) -> list[str]:
@@ -136,24 +111,6 @@ def _header(data: bytes, known: ChannelColumns) -> list[str]:
     if "t_s" not in header:
         raise DataError("column 't_s' is missing", remedy="add it: seconds from start_ns")
     return header
-
-
-def _check_times(t_ns: TimesNs, *, in_order: bool) -> None:
-    far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
-    if far.size:
-        raise DataError(
-            f"t_s is {t_ns[far[0]] * 1e-9:.9g}, which looks like Unix time",
-            remedy="t_s must be seconds from start_ns of meta.yaml",
-        )
-    back = np.flatnonzero(np.diff(t_ns) < 0)
-    if back.size and in_order:
-        i = int(back[0])
-        raise DataError(
-            f"time runs backwards from {t_ns[i] * 1e-9:.9f} to {t_ns[i + 1] * 1e-9:.9f} s at row {i + 2}",
-            channel="t_s",
-            time_s=float(t_ns[i]) * 1e-9,
-            remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
-        )
 
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
@@ -220,7 +177,7 @@ class ChannelReader:
 
     def __init__(
         self,
-        tables: Mapping[str, CsvTable],
+        tables: Mapping[str, TimedTable],
         meta: Meta,
         layouts: Layouts = WHEEL_LAYOUTS,
         rig: Rig | None = None,
@@ -242,7 +199,7 @@ class ChannelReader:
         fields = (table.numbers[names[0]] if len(names) == 1 else table.stack(names) for names in parts)
         return PLAIN[name](self._t(table), *fields)
 
-    def _wheels(self, table: CsvTable) -> Wheels:
+    def _wheels(self, table: TimedTable) -> Wheels:
         alone = [names for names, _ in self.layouts if {f"{n}_rad" for n in names} == {*table.numbers}]
         if alone:
             return self._wheels_of_angles(table, alone[0])
@@ -266,7 +223,7 @@ class ChannelReader:
         )
         return paired_sides(wheels)
 
-    def _wheels_of_angles(self, table: CsvTable, names: tuple[str, ...]) -> Wheels:
+    def _wheels_of_angles(self, table: TimedTable, names: tuple[str, ...]) -> Wheels:
         """Wheels of a table that has angles alone."""
         columns = [f"{name}_rad" for name in names]
         angle = table.stack(columns)
@@ -277,7 +234,7 @@ class ChannelReader:
         self.notes.append("wheels: no speeds are there; they are differences of the angles")
         return Wheels(self._t(table)[held][keep], speed, names, "radps", angle[keep])
 
-    def _wheel_layout(self, table: CsvTable) -> tuple[tuple[str, ...], str]:
+    def _wheel_layout(self, table: TimedTable) -> tuple[tuple[str, ...], str]:
         speeds = [c for c in table.numbers if not c.endswith("_rad")]
         for names, unit in self.layouts:
             if sorted(speeds) == sorted(f"{n}_{unit}" for n in names):
@@ -290,12 +247,12 @@ class ChannelReader:
         what = f"columns {', '.join(speeds) or '(none)'} are not a layout"
         raise DataError(what, remedy=f"give one of: {layouts}")
 
-    def _imu(self, table: CsvTable) -> Imu:
+    def _imu(self, table: TimedTable) -> Imu:
         if not table.numbers:
             raise DataError("no column beside t_s", remedy=f"give any of {', '.join([*GYRO, *ACCEL])}")
         return Imu(self._t(table), table.stack(GYRO), table.stack(ACCEL))
 
-    def _gnss(self, table: CsvTable) -> Gnss | None:
+    def _gnss(self, table: TimedTable) -> Gnss | None:
         has = table.numbers.__contains__
         missing = [name for name in GNSS_SIGMA[:2] if not has(name)]
         if missing and any(map(has, GNSS_SIGMA)):
@@ -327,7 +284,7 @@ class ChannelReader:
         sigma[lacking] = filled
         return sigma
 
-    def _fix(self, table: CsvTable) -> NDArray[np.uint8]:
+    def _fix(self, table: TimedTable) -> NDArray[np.uint8]:
         if "fix" not in table.texts:
             self.notes.append("gnss: the log has no fix class; all fixes are taken as 'single'")
             return np.full(len(table.t_ns), Fix.SINGLE, dtype=np.uint8)
@@ -337,19 +294,19 @@ class ChannelReader:
             if word not in codes:
                 row = int(np.flatnonzero(inverse == k)[0])
                 remedy = f"give one of {', '.join(fix.name.lower() for fix in Fix)}"
-                raise _row_error(table, row, f"column 'fix' is '{shown(word)}'", remedy)
+                raise table.error(row, f"column 'fix' is '{shown(word)}'", remedy)
         unknown = int((table.texts["fix"] == "").sum())
         if unknown:
             self.notes.append(f"gnss: {unknown} rows have no fix class; taken as 'single'")
         return np.array([codes[word] for word in words], dtype=np.uint8)[inverse]
 
-    def _motor(self, table: CsvTable) -> Motor:
+    def _motor(self, table: TimedTable) -> Motor:
         voltages = [name for name in VOLTAGES if name in table.numbers]
         if len(voltages) == 1:
             raise DataError(f"'{voltages[0]}' comes alone", remedy="give both voltages or none")
         return Motor(self._t(table), table.stack(CURRENTS), table.stack(VOLTAGES) if voltages else None)
 
-    def _terrain(self, table: CsvTable) -> Terrain:
+    def _terrain(self, table: TimedTable) -> Terrain:
         return Terrain(
             self._t(table),
             table.texts["label"],
@@ -358,7 +315,7 @@ class ChannelReader:
             table.stack(list(table.numbers)) if table.numbers else None,
         )
 
-    def _steering(self, table: CsvTable) -> Steering:
+    def _steering(self, table: TimedTable) -> Steering:
         layouts = [tuple(f"{name}_rad" for name in names) for names in Steering.LAYOUTS]
         for names, layout in zip(Steering.LAYOUTS, layouts, strict=True):
             if sorted(table.numbers) == sorted(layout):
@@ -366,7 +323,7 @@ class ChannelReader:
         what = f"columns {', '.join(table.numbers) or '(none)'} are not a layout"
         raise DataError(what, remedy=f"give one of: {' | '.join(map(', '.join, layouts))}")
 
-    def _truth(self, table: CsvTable) -> Trajectory:
+    def _truth(self, table: TimedTable) -> Trajectory:
         quaternion = self._quaternion(table)
         twist = None
         if any(name in table.numbers for name in TRUTH_TWIST):
@@ -379,7 +336,7 @@ class ChannelReader:
         except DataError as error:
             raise DataError(error.what, time_s=error.time_s, remedy=error.remedy) from None
 
-    def _quaternion(self, table: CsvTable) -> Array | None:
+    def _quaternion(self, table: TimedTable) -> Array | None:
         present = [name for name in QUATERNION if name in table.numbers]
         if not present:
             return None
@@ -391,10 +348,10 @@ class ChannelReader:
         off = np.flatnonzero(np.abs(norm - 1.0) > 0.01)
         if off.size:
             what = f"the quaternion has norm {norm[off[0]]:.3g}"
-            raise _row_error(table, int(off[0]), what, "give unit quaternions x, y, z, w")
+            raise table.error(int(off[0]), what, "give unit quaternions x, y, z, w")
         return q
 
-    def _covariance(self, table: CsvTable) -> Array | None:
+    def _covariance(self, table: TimedTable) -> Array | None:
         """(N, 6, 6); what is missing below the diagonal is taken from above it."""
         present = [name for name in COVARIANCE if name in table.numbers]
         if not present:
@@ -407,10 +364,10 @@ class ChannelReader:
             out[:, i, j] = table.numbers[name if name in table.numbers else mirrored]
         return out
 
-    def _t(self, table: CsvTable) -> NDArray[np.int64]:
+    def _t(self, table: TimedTable) -> NDArray[np.int64]:
         return table.t_ns + np.int64(self.meta.start_ns)
 
-    def _table(self, channel: str) -> CsvTable | None:
+    def _table(self, channel: str) -> TimedTable | None:
         """The channel's rows that hold a value, or None when the table is absent or has none."""
         table = self.tables.get(channel)
         if table is None:
@@ -423,7 +380,7 @@ class ChannelReader:
             raise DataError(what, remedy=f"needed: t_s, {', '.join(required)}")
         return table if self.meta.keep_empty else self._with_values(channel, table)
 
-    def _with_values(self, channel: str, table: CsvTable) -> CsvTable | None:
+    def _with_values(self, channel: str, table: TimedTable) -> TimedTable | None:
         held = rows_with_values(table.numbers, len(table.t_ns))
         if channel == "terrain":
             held = table.texts["label"] != ""
@@ -431,14 +388,9 @@ class ChannelReader:
         if empty:
             self.notes.append(f"{channel}: {empty} of {len(held)} rows hold no value and were left out")
         if not held.any() and (table.numbers or table.texts):
-            self.notes.append(f"{channel}: {table.file} holds no sample; the channel is absent")
+            self.notes.append(f"{channel}: {table.path.name} holds no sample; the channel is absent")
             return None
         return table.select(held) if empty else table
-
-
-def _row_error(table: CsvTable, row: int, what: str, remedy: str) -> DataError:
-    time_s = float(table.t_ns[row]) * 1e-9
-    return DataError(f"{what} at data row {row + 1}", time_s=time_s, remedy=remedy)
 
 
 def rows_with_values(numbers: Mapping[str, Array], n: int) -> Mask:

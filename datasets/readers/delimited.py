@@ -108,9 +108,13 @@ class TextTable(Columns):
         except NotADecimal as bad:
             raise self.bad_cell(name, bad.row, remedy or f"give a time in {unit}") from None
 
+    def line(self, row: int) -> tuple[int, list[str]]:
+        """Number, from 1, and cells of the line of a data row (from 0)."""
+        return next(islice(_rows(self.data, self.layout), row, None), (0, []))
+
     def bad_cell(self, name: str, row: int, remedy: str) -> DataError:
         """The error for column `name` of data row `row` (from 0)."""
-        line, cells = next(islice(_rows(self.data, self.layout), row, None), (0, []))
+        line, cells = self.line(row)
         cell = dict(zip(self.layout.names, cells, strict=False)).get(name, "")
         what = f"line {line} has no '{name}'" if not cell.strip() else _cell_is(name, cell, line)
         return _line_error(self.data, self.layout, what, cells, remedy)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.clock import repaired_rows
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Recording
@@ -21,6 +20,7 @@ from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, read_table
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
+from terrafusion.datasets.readers.timed_tables import in_time
 
 META = "meta.yaml"
 CHANNELS = (*Recording.CHANNELS, "truth")
@@ -41,12 +41,8 @@ def read(request: Request) -> list[Recording]:
     folder = request.path
     meta = _meta(folder)
     paths = {name: path for name in CHANNELS if (path := _csv_of(folder, name)) is not None}
-    in_order = not request.repair_clock
-    tables = {name: read_table(path, COLUMNS[name], in_order=in_order) for name, path in paths.items()}
-    times = {name: table.t_ns for name, table in tables.items()}
-    clocks = repaired_rows(times) if request.repair_clock else {}
-    for name, own in clocks.items():
-        tables[name] = dataclasses.replace(tables[name].select(own.order), t_ns=own.t_ns)
+    tables = {name: read_table(path, COLUMNS[name]) for name, path in paths.items()}
+    tables, jumps, clock = in_time(tables, repair_clock=request.repair_clock)
     reader, channels = ChannelReader(tables, meta, rig=request.rig), {}
     for name in CHANNELS:
         with errors_of(paths.get(name, folder)):
@@ -54,9 +50,8 @@ def read(request: Request) -> list[Recording]:
     if not any(channel is not None and len(channel) for channel in channels.values()):
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
-    notes = [*reader.notes, *(note for own in clocks.values() for note in own.notes), *_unknown_files(folder)]
+    notes = [*reader.notes, *clock, *_unknown_files(folder)]
     recording = recording_of(channels, meta, folder.resolve().name, notes)
-    jumps = (jump for own in clocks.values() for jump in own.jumps)
     moved = (dataclasses.replace(jump, t_ns=jump.t_ns + meta.start_ns) for jump in jumps)
     return [dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))]
 

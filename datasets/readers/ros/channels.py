@@ -41,6 +41,7 @@ from terrafusion.datasets.readers.ros.static_frames import (
 )
 from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import Fixes, located
+from terrafusion.datasets.readers.timed_tables import fresh
 
 Datum = tuple[float, float, float]
 
@@ -358,12 +359,11 @@ class ChannelBuilder:
         twist = self._truth_twist(stream)
         child = str(stream.column("child_frame_id")[0]) if stream.has("child_frame_id") else ""
         frame = "antenna" if any(word in child.lower() for word in ("antenna", "gps", "gnss")) else "base"
-        fresh = np.concatenate([[True], np.diff(t_ns) > 0])
-        if not fresh.all():
-            self.notes.append(f"truth: {int((~fresh).sum())} poses with a repeated time left out")
-        columns = (position, orientation, twist, covariance)
-        fresh_columns = [None if column is None else column[fresh] for column in columns]
-        return Trajectory(t_ns[fresh], position[fresh], *fresh_columns[1:]), frame
+        once = fresh(t_ns)
+        if not once.all():
+            self.notes.append(f"truth: {int((~once).sum())} poses with a repeated time left out")
+        others = (None if column is None else column[once] for column in (orientation, twist, covariance))
+        return Trajectory(t_ns[once], position[once], *others), frame
 
     def _truth_twist(self, stream: Stream) -> Array | None:
         if stream.msgtype != topics.ODOMETRY:

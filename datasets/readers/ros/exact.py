@@ -22,7 +22,6 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import (
     COLUMNS,
     ChannelReader,
-    CsvTable,
     Layouts,
     wheel_columns,
 )
@@ -31,6 +30,7 @@ from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.streams import Stream, wanted_fields
+from terrafusion.datasets.readers.timed_tables import TimedTable
 
 Key = tuple[str, str]
 """Name and type of a topic."""
@@ -86,7 +86,7 @@ def restore(
     found = read(asked)
     streams = {name: found[key] for name, key in keys.items() if key in there}
     names = [name for name in CHANNELS if name in saved.tables]
-    tables = {name: _table(saved, name, streams.get(name), file.name) for name in names}
+    tables = {name: _table(saved, name, streams.get(name), file) for name in names}
     reader = ChannelReader(tables, saved.meta, LAYOUTS)
     builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {}, as_written=True)
     channels = {
@@ -129,7 +129,7 @@ def _standard(builder: ChannelBuilder, name: str, stream: Stream | None, shift_n
     return getattr(builder, name)(stream, t_ns)
 
 
-def _table(saved: SavedChannels, channel: str, stream: Stream | None, file: str) -> CsvTable:
+def _table(saved: SavedChannels, channel: str, stream: Stream | None, file: Path) -> TimedTable:
     columns, known = saved.tables[channel], COLUMNS[channel]
     names = {*known.numbers, *known.texts} | ({*wheel_columns(LAYOUTS)} if channel == "wheels" else set())
     strange = [c for c in columns if c not in names and not c.startswith(known.prefixes)]
@@ -153,7 +153,7 @@ def _table(saved: SavedChannels, channel: str, stream: Stream | None, file: str)
         if not ((codes >= 0) & (codes < len(words)) & (codes == np.rint(codes))).all():
             raise _error(channel, f"a {name} that stands for no word")
         texts[name] = np.array([*words, None], dtype=object)[codes.astype(np.int64)]
-    return CsvTable(t_ns=t_ns, file=file, numbers=numbers, texts=texts)
+    return TimedTable(t_ns=t_ns, path=file, numbers=numbers, texts=texts)
 
 
 def _error(channel: str, what: str) -> DataError:

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.delimited import head_lines, split
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.rows import NumberRows, put_in_time, read_rows
+from terrafusion.datasets.readers.timed_tables import TimedTable, in_time, read_rows
 
 COLUMNS = {
     "imu": ("time", "wx", "wy", "wz", "ax", "ay", "az"),
@@ -56,7 +56,7 @@ def read(request: Request) -> list[Recording]:
         for kind, path in files.items()
         if path.is_file()
     }
-    rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
+    rows, jumps, clock = in_time(rows, repair_clock=request.repair_clock)
     for r in rows.values():
         if abs(int(r.t_ns[0])) > LATEST_START_NS:
             raise DataError(
@@ -70,9 +70,9 @@ def read(request: Request) -> list[Recording]:
     recording = Recording(
         name=f"{folder.resolve().name}/{run}",
         start_ns=0,
-        wheels=Wheels(pro.t_ns, pro.values[:, 2:], ("left", "right"), "mps") if pro else None,
-        imu=Imu(imu.t_ns, imu.values[:, :3], imu.values[:, 3:]) if imu else None,
-        motor=Motor(pro.t_ns, pro.values[:, :2]) if pro else None,
+        wheels=Wheels(pro.t_ns, pro.stack(("velL", "velR")), ("left", "right"), "mps") if pro else None,
+        imu=Imu(imu.t_ns, imu.stack(("wx", "wy", "wz")), imu.stack(("ax", "ay", "az"))) if imu else None,
+        motor=Motor(pro.t_ns, pro.stack(("curL", "curR"))) if pro else None,
         terrain=Terrain.throughout(0, terrain) if terrain else None,
         terrain_name=terrain,
         clock_jumps=jumps,
@@ -101,7 +101,7 @@ def _terrain(folder: str) -> tuple[str, str]:
     return label, f"terrain: '{label}' from the folder {folder}{known}"
 
 
-def _pairing(rows: dict[str, NumberRows]) -> list[str]:
+def _pairing(rows: dict[str, TimedTable]) -> list[str]:
     """How the two files were put together, and what their times are worth."""
     notes = ["times count from the start of the run; the set has no absolute ones"]
     if len(rows) == 1:

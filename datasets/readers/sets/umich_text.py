@@ -20,7 +20,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.rows import NumberRows, are_numbers, put_in_time, read_rows
+from terrafusion.datasets.readers.timed_tables import TimedTable, are_numbers, fresh, in_time, read_rows
 
 POSE = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 COLUMNS = {
@@ -79,7 +79,7 @@ def read(request: Request) -> list[Recording]:
     assert given is not None, "claimed by its name"
     name, parts = _family(given)
     rows = {part.kind: read_rows(part.path, COLUMNS[part.kind]) for part in parts}
-    rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
+    rows, jumps, clock = in_time(rows, repair_clock=request.repair_clock)
     rows, apart = _contemporaries(rows, given.kind)
     others = ", ".join(r.path.name for r in rows.values() if r.path != given.path)
     joined = f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
@@ -93,7 +93,7 @@ def read(request: Request) -> list[Recording]:
         name=name or request.path.resolve().parent.name,
         start_ns=max(min(int(r.t_ns[0]) for r in rows.values()), 0),  # no recording starts before 1970
         wheels=wheels,
-        imu=Imu(imu.t_ns, imu.values[:, :3], imu.values[:, 3:]) if imu else None,
+        imu=Imu(imu.t_ns, imu.stack(("wx", "wy", "wz")), imu.stack(("ax", "ay", "az"))) if imu else None,
         truth=truth,
         truth_channels=held if "center" in rows else tuple(name for name in held if name != "position"),
         clock_jumps=tuple(
@@ -148,7 +148,7 @@ def _choice(given: RecordingFile, kind: str, candidates: list[RecordingFile]) ->
     return same[0]
 
 
-def _contemporaries(rows: dict[str, NumberRows], given: str) -> tuple[dict[str, NumberRows], list[str]]:
+def _contemporaries(rows: dict[str, TimedTable], given: str) -> tuple[dict[str, TimedTable], list[str]]:
     """The files that share time with the given one, and a note for each other."""
     first, last = rows[given].t_ns[0], rows[given].t_ns[-1]
     shared = {kind: r for kind, r in rows.items() if r.t_ns[0] <= last and r.t_ns[-1] >= first}
@@ -159,23 +159,23 @@ def _contemporaries(rows: dict[str, NumberRows], given: str) -> tuple[dict[str, 
     ]
 
 
-def _wheels(rows: NumberRows | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
+def _wheels(rows: TimedTable | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
     """The speed of the wheels; what moves sideways is the velocity of another source."""
     if rows is None:
         return None, []
-    sideways = np.flatnonzero(rows.values[:, 1:].any(axis=1))
+    sideways = np.flatnonzero(rows.stack(("vy", "vz")).any(axis=1))
     if not sideways.size:
         note = "wheels: vy and vz are zero throughout and left out; the speed says nothing of yaw"
-        return Wheels(rows.t_ns, rows.values[:, :1], ("speed",), "mps"), [note]
+        return Wheels(rows.t_ns, rows.stack(("vx",)), ("speed",), "mps"), [note]
     if not asked_for:
         return None, [f"{rows.path.name} moves sideways: no speed of wheels; left out"]
-    vy, vz = rows.values[sideways[0], 1:]
+    vy, vz = (rows.numbers[name][sideways[0]] for name in ("vy", "vz"))
     what = f"wheels that move sideways: vy {vy:g}, vz {vz:g} m/s"
     remedy = "are the columns t, vx, vy, vz? a body velocity of another source is not read as wheels"
     raise rows.error(int(sideways[0]), what, remedy)
 
 
-def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
+def _truth(rows: dict[str, TimedTable]) -> tuple[Trajectory | None, list[str]]:
     """The centre's path; the front body's where there is no other."""
     paths = {kind: _trajectory(rows[kind]) for kind in ("center", "front") if kind in rows}
     if not paths:
@@ -189,23 +189,24 @@ def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
     return truth, notes
 
 
-def _trajectory(rows: NumberRows) -> tuple[Trajectory, list[str]]:
-    norm = np.linalg.norm(rows.values[:, 3:], axis=1)
+def _trajectory(rows: TimedTable) -> tuple[Trajectory, list[str]]:
+    norm = np.linalg.norm(rows.stack(POSE[4:]), axis=1)
     bad = np.flatnonzero(np.abs(norm - 1.0) > NORM_TOLERANCE)
     if bad.size:
         row = int(bad[0])
         remedy = "are the columns t, x, y, z, qx, qy, qz, qw?"
         raise rows.error(row, f"the quaternion has length {norm[row]:.3f}, not 1", remedy)
     notes = []
-    fresh = np.concatenate([[True], np.diff(rows.t_ns) > 0])
-    if not fresh.all():
-        notes.append(f"{int((~fresh).sum())} rows repeat a time; only the first of each is used")
-        rows = rows.select(fresh)
+    once = fresh(rows.t_ns)
+    if not once.all():
+        notes.append(f"{int((~once).sum())} rows repeat a time; only the first of each is used")
+        rows = rows.select(once)
     if len(rows) > 1:
         notes += _gaps(rows.t_ns)
-    if np.abs(rows.values[0, :6]).max() > NORM_TOLERANCE:
+    position, quaternion = rows.stack(POSE[1:4]), rows.stack(POSE[4:])
+    if max(np.abs(position[0]).max(), np.abs(quaternion[0, :3]).max()) > NORM_TOLERANCE:
         notes.append("does not start at the identity, as this format does: check its axes")
-    return Trajectory(rows.t_ns, rows.values[:, :3], rows.values[:, 3:]), notes
+    return Trajectory(rows.t_ns, position, quaternion), notes
 
 
 def _gaps(t_ns: TimesNs) -> list[str]:

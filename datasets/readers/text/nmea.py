@@ -26,7 +26,7 @@ from terrafusion.datasets.core.sensors import assumed_sigma
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_recording
-from terrafusion.datasets.readers.text.rows import row_times
+from terrafusion.datasets.readers.timed_tables import row_times
 
 CHECKED_SENTENCE = re.compile(
     r"\$(([A-Z]{2})(GGA|RMC|GST|ZDA|VTG),([\x20-\x23\x25-\x29\x2b-\x7e]{0,200}))(\*([0-9A-Fa-f]{2}))?"

@@ -30,7 +30,7 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_recording
-from terrafusion.datasets.readers.text.rows import row_times
+from terrafusion.datasets.readers.timed_tables import row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
 POSITIONS = {

@@ -23,7 +23,6 @@ from terrafusion.datasets.readers.channel_tables import (
     GNSS_VELOCITY,
     QUATERNION,
     ChannelReader,
-    CsvTable,
 )
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
@@ -40,8 +39,8 @@ from terrafusion.datasets.readers.text.column_map import (
 )
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
-from terrafusion.datasets.readers.text.rows import row_times
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
+from terrafusion.datasets.readers.timed_tables import TimedTable, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 
@@ -120,7 +119,7 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
     t_s = times.t_ns - start_ns
-    tables = {name: _table(columns, of, times.order, t_s, request.path.name) for name, of in fields.items()}
+    tables = {name: _table(columns, of, times.order, t_s, request.path) for name, of in fields.items()}
     reader = _Reader(tables, meta, request)
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
@@ -169,8 +168,8 @@ def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[s
 
 
 def _table(
-    columns: TableColumns, fields: Mapping[str, MappedColumn], order: Any, t_ns: TimesNs, file: str
-) -> CsvTable:
+    columns: TableColumns, fields: Mapping[str, MappedColumn], order: Any, t_ns: TimesNs, path: Path
+) -> TimedTable:
     """The mapped columns of a channel in SI units, its rows in the `order` of their times."""
     texts = {name: _words(columns, name, of)[order] for name, of in fields.items() if name in TEXT_FIELDS}
     numbers = {}
@@ -183,7 +182,7 @@ def _table(
         yaw = numbers.pop("yaw_rad")
         rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)
         numbers |= dict(zip(QUATERNION, rpy_to_quaternion(rpy).T, strict=True))
-    return CsvTable(t_ns=t_ns, file=file, numbers=numbers, texts=texts)
+    return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 
 def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
@@ -217,12 +216,12 @@ class _Reader(ChannelReader):
 
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}
 
-    def __init__(self, tables: Mapping[str, CsvTable], meta: Meta, request: Request) -> None:
+    def __init__(self, tables: Mapping[str, TimedTable], meta: Meta, request: Request) -> None:
         super().__init__(tables, meta)
         self.request = request
         self.datum: Datum | None = meta.datum
 
-    def _gnss(self, table: CsvTable) -> Gnss | None:
+    def _gnss(self, table: TimedTable) -> Gnss | None:
         for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
             if (a in table.numbers) != (b in table.numbers):
                 raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")

@@ -28,7 +28,6 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
-from terrafusion.datasets.readers.text.rows import row_times
 from terrafusion.datasets.readers.text.xsens_motion import (
     ACC,
     ATTITUDES,
@@ -38,6 +37,7 @@ from terrafusion.datasets.readers.text.xsens_motion import (
     clock_of,
     inertial,
 )
+from terrafusion.datasets.readers.timed_tables import row_times
 
 COUNTERS = ("PacketCounter", "Counter")
 TICKS = "SampleTimeFine"

@@ -228,7 +228,11 @@ BAD_TABLES = {
     ),
     "no time": ("imu", "t_s,gyro_z_radps\n0,0\n,0\n", ["line 3", "t_s"]),
     "nan time": ("imu", "t_s,gyro_z_radps\n0,0\nnan,0\n", ["line 3", "t_s", "'nan'"]),
-    "backwards": ("imu", "t_s,gyro_z_radps\n0,0\n2,0\n1.5,0\n", ["backwards", "t = 2.000 s", "sort"]),
+    "backwards": (
+        "imu",
+        "t_s,gyro_z_radps\n0,0\n2,0\n1.5,0\n",
+        ["line 4", "backwards by 0.5", "sort"],
+    ),
     "unix time": ("imu", "t_s,gyro_z_radps\n1700000000.5,0\n", ["Unix time", "start_ns"]),
     "no t_s": ("imu", "time,gyro_z_radps\n0,0\n", ["'time'", "t_s"]),
     "unknown column": ("imu", "t_s,gyro_z_rad\n0,0\n", ["'gyro_z_rad'", "did you mean 'gyro_z_radps'"]),

@@ -110,7 +110,7 @@ def test_bad_files_are_told_in_one_line(tmp_path: Path, case: str) -> None:
 
 def test_quaternions_that_are_none(tmp_path: Path) -> None:
     text = "".join(f"{k} {POSE}\n" for k in range(100)) + "100 0 0 0 0 0 0 0\n"
-    with pytest.raises(DataError, match="norm 0 in row 101"):
+    with pytest.raises(DataError, match="line 101: the quaternion has norm 0"):
         open_recording(poses(tmp_path, text))
 
 
