@@ -186,6 +186,7 @@ class ChannelReader:
         self.meta = meta
         self.layouts = layouts
         self.rig = rig
+        self.datum = meta.datum
         self.notes: list[str] = list(meta.remarks)
 
     def channel(self, name: str) -> Any:

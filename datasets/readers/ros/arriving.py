@@ -21,12 +21,13 @@ from terrafusion.datasets.core.messages import Message, WheelSample
 from terrafusion.datasets.core.wrapped_angles import TurnCounter
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics
-from terrafusion.datasets.readers.ros.channels import ChannelBuilder, Datum
+from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch, batches_of
 from terrafusion.datasets.readers.ros.streams import Stream, broken_bag_on_error, types_of, wanted_fields
 from terrafusion.datasets.readers.ros.topics import joints_given
+from terrafusion.datasets.readers.text.fixes import Datum
 
 LIVE = Path("live")
 """Stands in errors where a bag has its path."""

@@ -21,7 +21,7 @@ from terrafusion.datasets.core.channels import (
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permuted
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import turned_by
-from terrafusion.datasets.core.sensors import Rig, with_assumed_sigma
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
 from terrafusion.datasets.readers.ros import topics
@@ -40,10 +40,8 @@ from terrafusion.datasets.readers.ros.static_frames import (
     tells_turn,
 )
 from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
-from terrafusion.datasets.readers.text.fixes import Fixes, located
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.timed_tables import fresh
-
-Datum = tuple[float, float, float]
 
 NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
@@ -283,15 +281,11 @@ class ChannelBuilder:
         fix = np.where(status >= 0, Fix.SINGLE, Fix.NONE).astype(np.uint8)
         for number, fix_class in FIX_OF_STATUS.items():
             fix[status == number] = fix_class
-        fixes = Fixes(t_ns, self._llh(stream), fix, np.full((len(stream), 3), np.nan))
+        fixes = Fixes(t_ns, self._llh(stream), fix, self._sigma(stream))
         rows = f"messages of {stream.topic}"
-        held, enu, datum, notes = located(fixes, datum, channel=stream.topic, rows=rows)
+        gnss, datum, notes = gnss_channel(self.rig, fixes, datum, rows=rows, channel=stream.topic)
         self.notes += notes
-        if not held.any():
-            return None, datum
-        sigma, notes = with_assumed_sigma(self.rig, self._sigma(stream.select(held)), fix[held])
-        self.notes += notes
-        return Gnss(t_ns[held], enu, sigma, fix[held]), datum
+        return gnss, datum
 
     def _llh(self, stream: Stream) -> Array:
         """Latitude, longitude (deg) and height (m), (N, 3)."""

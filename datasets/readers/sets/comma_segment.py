@@ -183,14 +183,10 @@ def _gnss(request: Request, signal: Signal | None) -> tuple[Gnss | None, Datum |
     latitude, longitude, speed, _, altitude, bearing = rows[times.order].T
     course = np.radians(bearing)
     velocity = np.stack([speed * np.sin(course), speed * np.cos(course), np.full(len(speed), np.nan)], axis=1)
-    fixes = Fixes(
-        times.t_ns,
-        np.stack([latitude, longitude, altitude], axis=1),
-        np.full(len(speed), Fix.SINGLE, dtype=np.uint8),
-        np.full((len(speed), 3), np.nan),
-        velocity,
-    )
-    gnss, datum, about = gnss_channel(request, fixes)
+    llh = np.stack([latitude, longitude, altitude], axis=1)
+    single = np.full(len(speed), Fix.SINGLE, dtype=np.uint8)
+    fixes = Fixes(times.t_ns, llh, single, velocity_enu_mps=velocity)
+    gnss, datum, about = gnss_channel(request.rig, fixes)
     return gnss, datum, [*notes, "gnss: times are the fixes' own UTC", *about]
 
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import Array, Mask, TimeRows, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimeRows, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.clock import RowTimes
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import with_assumed_sigma
+from terrafusion.datasets.core.sensors import Rig, with_assumed_sigma
 from terrafusion.datasets.readers.formats import Request
 
 Datum = tuple[float, float, float]
@@ -27,7 +27,7 @@ class Fixes(TimeRows):
         llh: (N, 3) latitude deg, longitude deg, ellipsoidal height m; NaN where unknown. With `local`
             they are east, north and up of the datum, m.
         fix: (N,) `Fix` values.
-        sigma_enu_m: (N, 3), NaN where unknown.
+        sigma_enu_m: (N, 3), NaN where unknown; None where no fix has any.
         velocity_enu_mps: (N, 3), NaN where unknown, or None.
         sigma_v_mps: (N,), or None.
     """
@@ -35,16 +35,19 @@ class Fixes(TimeRows):
     t_ns: TimesNs
     llh: Array
     fix: NDArray[np.uint8]
-    sigma_enu_m: Array
+    sigma_enu_m: Array | None = None
     velocity_enu_mps: Array | None = None
     sigma_v_mps: Array | None = None
     local: bool = False
 
 
 def gnss_channel(
-    request: Request, fixes: Fixes, datum: Datum | None = None
+    rig: Rig | None, fixes: Fixes, datum: Datum | None = None, *, rows: str = "rows", channel: str = "gnss"
 ) -> tuple[Gnss | None, Datum | None, list[str]]:
     """The fixes about `datum`, or about the first of them; unknown sigmas are assumed.
+
+    Latitude and longitude 0, 0 is no position in a log that is elsewhere. `rows` and `channel` are what
+    notes and errors call the fixes.
 
     Returns:
         The channel without the rows that hold no fix (None where none does), the datum, and notes.
@@ -52,11 +55,39 @@ def gnss_channel(
     Raises:
         DataError: a latitude or longitude that is not on Earth.
     """
-    held, enu, datum, notes = located(fixes, datum)
+    held = np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE)
+    if not fixes.local and held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
+        held &= (fixes.llh[:, :2] != 0.0).any(axis=1)
+    notes = []
+    if not held.all():
+        notes.append(f"gnss: {int((~held).sum())} of {len(held)} {rows} hold no fix; left out")
     if not held.any():
-        return None, datum, [*notes, "gnss: no row holds a fix; the channel is absent"]
-    fixes = fixes.select(held)
-    sigma, note = with_assumed_sigma(request.rig, fixes.sigma_enu_m, fixes.fix)
+        return None, datum, [*notes, f"gnss: none of the {rows} holds a fix; the channel is absent"]
+    first_ns, fixes = fixes.t_ns[0], fixes.select(held)
+    enu = fixes.llh
+    if not fixes.local:
+        llh = fixes.llh.copy()
+        off = np.flatnonzero((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
+        if off.size:
+            i = int(off[0])
+            raise DataError(
+                f"latitude {llh[i, 0]:g} deg, longitude {llh[i, 1]:g} deg is not on Earth",
+                channel=channel,
+                time_s=float(fixes.t_ns[i] - first_ns) * 1e-9,
+                remedy="give degrees up to 90 and 180; are they swapped, or in another unit?",
+            )
+        flat = np.isnan(llh[:, 2])
+        if datum is None:
+            datum = float(llh[0, 0]), float(llh[0, 1]), 0.0 if flat.all() else float(llh[~flat, 2][0])
+            latitude, longitude, height = datum
+            notes.append(
+                f"gnss: datum is the first fix, {latitude:.7f} deg, {longitude:.7f} deg, {height:.2f} m"
+            )
+        llh[flat, 2] = datum[2]
+        enu = geodetic_to_enu(llh, datum)
+        enu[flat, 2] = np.nan
+    sigma = np.full(enu.shape, np.nan) if fixes.sigma_enu_m is None else fixes.sigma_enu_m
+    sigma, note = with_assumed_sigma(rig, sigma, fixes.fix)
     velocity, sigma_v = fixes.velocity_enu_mps, fixes.sigma_v_mps
     if velocity is None or not np.isfinite(velocity[:, :2]).any():
         velocity = sigma_v = None
@@ -67,7 +98,7 @@ def gnss_recording(
     request: Request, fixes: Fixes, datum: Datum | None, source: str, notes: Sequence[str], times: RowTimes
 ) -> Recording:
     """The recording of a log of fixes alone, with what `gnss_channel` notes; a DataError without a fix."""
-    gnss, datum, more = gnss_channel(request, fixes, datum)
+    gnss, datum, more = gnss_channel(request.rig, fixes, datum)
     if gnss is None:
         raise DataError("holds no fix", remedy="record it under open sky, or process it again")
     return Recording(
@@ -79,43 +110,3 @@ def gnss_recording(
         notes=(*notes, *more),
         clock_jumps=times.jumps,
     )
-
-
-def located(
-    fixes: Fixes, datum: Datum | None, *, channel: str = "gnss", rows: str = "rows"
-) -> tuple[Mask, Array, Datum | None, list[str]]:
-    """Which of the fixes (N,) hold a position, their ENU positions (M, 3), the datum, and notes.
-
-    Latitude and longitude 0, 0 is no position in a log that is elsewhere.
-
-    Raises:
-        DataError: a latitude or longitude that is not on Earth.
-    """
-    held = np.asarray(np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE))
-    if not fixes.local and held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
-        held &= (fixes.llh[:, :2] != 0.0).any(axis=1)
-    notes = []
-    if not held.all():
-        notes.append(f"gnss: {int((~held).sum())} of {len(held)} {rows} hold no fix; left out")
-    llh = fixes.llh[held]
-    if fixes.local or not held.any():
-        return held, llh, datum, notes
-    bad = np.flatnonzero((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
-    if bad.size:
-        i = int(bad[0])
-        raise DataError(
-            f"latitude {llh[i, 0]:g} deg, longitude {llh[i, 1]:g} deg is not on Earth",
-            channel=channel,
-            time_s=float(fixes.t_ns[held][i] - fixes.t_ns[0]) * 1e-9,
-            remedy="give degrees up to 90 and 180; are they swapped, or in another unit?",
-        )
-    flat = np.isnan(llh[:, 2])
-    if datum is None:
-        datum = float(llh[0, 0]), float(llh[0, 1]), 0.0 if flat.all() else float(llh[~flat, 2][0])
-        notes.append(
-            f"gnss: datum is the first fix, {datum[0]:.7f} deg, {datum[1]:.7f} deg, {datum[2]:.2f} m"
-        )
-    llh[flat, 2] = datum[2]
-    enu = geodetic_to_enu(llh, datum)
-    enu[flat, 2] = np.nan
-    return held, enu, datum, notes

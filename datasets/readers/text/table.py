@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import TimesNs, distinct
-from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import with_assumed_sigma
 from terrafusion.datasets.readers.channel_tables import (
     GNSS_SIGMA,
     GNSS_VELOCITY,
@@ -27,7 +26,6 @@ from terrafusion.datasets.readers.channel_tables import (
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
-from terrafusion.datasets.readers.log_meta import Meta
 from terrafusion.datasets.readers.text.column_map import (
     GEODETIC,
     TEXT_FIELDS,
@@ -37,7 +35,7 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
     units_of,
 )
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
 from terrafusion.datasets.readers.timed_tables import TimedTable, row_times
@@ -120,7 +118,7 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
     t_s = times.t_ns - start_ns
     tables = {name: _table(columns, of, times.order, t_s, request.path) for name, of in fields.items()}
-    reader = _Reader(tables, meta, request)
+    reader = _Reader(tables, meta, rig=request.rig)
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
@@ -216,30 +214,20 @@ class _Reader(ChannelReader):
 
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}
 
-    def __init__(self, tables: Mapping[str, TimedTable], meta: Meta, request: Request) -> None:
-        super().__init__(tables, meta)
-        self.request = request
-        self.datum: Datum | None = meta.datum
-
     def _gnss(self, table: TimedTable) -> Gnss | None:
         for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
             if (a in table.numbers) != (b in table.numbers):
                 raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
         local = "latitude_deg" not in table.numbers
-        place = table.stack(("east_m", "north_m", "up_m") if local else GEODETIC)
-        fix, sigma = self._fix(table), table.stack(GNSS_SIGMA)
-        velocity = table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None
-        sigma_v = table.numbers.get("sigma_v_mps")
-        if not local:
-            fixes = Fixes(self._t(table), place, fix, sigma, velocity, sigma_v)
-            channel, self.datum, notes = gnss_channel(self.request, fixes, self.datum)
-            self.notes += notes
-            return channel
-        sigma, notes = with_assumed_sigma(self.request.rig, sigma, fix)
+        fixes = Fixes(
+            self._t(table),
+            table.stack(("east_m", "north_m", "up_m") if local else GEODETIC),
+            self._fix(table),
+            table.stack(GNSS_SIGMA),
+            table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None,
+            table.numbers.get("sigma_v_mps"),
+            local,
+        )
+        gnss, self.datum, notes = gnss_channel(self.rig, fixes, self.datum)
         self.notes += notes
-        gnss = Gnss(self._t(table), place, sigma, fix, velocity, sigma_v)
-        held = fix > Fix.NONE
-        if held.all():
-            return gnss
-        self.notes.append(f"gnss: {int((~held).sum())} rows hold no fix; left out")
-        return gnss.select(held) if held.any() else None
+        return gnss

@@ -168,8 +168,8 @@ def _gnss(
     notes = ["gnss: the position is the device's own, fused with its IMU: errors of near fixes go together"]
     fix, fix_notes = _fix(columns)
     velocity, more = _velocity(columns, settings)
-    fixes = Fixes(t_ns, llh, fix, np.full(llh.shape, np.nan), velocity).select(rows)
-    gnss, datum, rest = gnss_channel(request, fixes)
+    fixes = Fixes(t_ns, llh, fix, velocity_enu_mps=velocity).select(rows)
+    gnss, datum, rest = gnss_channel(request.rig, fixes)
     return gnss, datum, [*notes, *fix_notes, *more, *rest]
 
 
