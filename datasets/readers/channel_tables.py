@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, Mask, distinct
 from terrafusion.datasets.core.channels import (
     Barometer,
@@ -92,7 +91,6 @@ def _header(data: bytes, known: ChannelColumns) -> list[str]:
         header = [name.strip() for name in next(csv.reader([data.split(b"\n", 1)[0].decode()]), [])]
     except csv.Error as error:
         raise not_a_table(1, error) from None
-    limits.check_columns(len(header))
     for mark, named in ((";", "a semicolon"), ("\t", "a tab")):
         if len(header) == 1 and mark in header[0]:
             what = f"the columns are separated by {named}"
@@ -105,9 +103,6 @@ def _header(data: bytes, known: ChannelColumns) -> list[str]:
         meant = f"did you mean '{close[0]}'? " if close else ""
         listed = ", ".join([*allowed, *(f"{p}<name>" for p in known.prefixes)])
         raise DataError(f"unknown column '{shown(name)}'", remedy=f"{meant}allowed: {listed}")
-    repeated = limits.repeated(header)
-    if repeated:
-        raise DataError(f"column '{shown(repeated)}' comes twice", remedy="keep one of them")
     if "t_s" not in header:
         raise DataError("column 't_s' is missing", remedy="add it: seconds from start_ns")
     return header

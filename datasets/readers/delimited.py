@@ -222,11 +222,15 @@ def read_columns(
         numbers: columns of numbers; empty and NaN cells are missing values.
 
     Raises:
-        DataError: no rows, a line with too few or too many cells, a cell that is no finite number.
+        DataError: too many columns, or two of one name; no rows, a line with too few or too many cells,
+            a cell that is no finite number.
     """
     end, notes = _complete_end(path, text, layout)
     data = text[:end]
     limits.check_columns(len(layout.names))
+    repeated = limits.repeated(name for name in layout.names if name)
+    if repeated:
+        raise DataError(f"column '{shown(repeated)}' comes twice", remedy="keep or rename one of them")
     if data.count(b"\n") * (len(numbers) + len(texts)) > limits.VALUES:
         raise limits.too_much("values", limits.VALUES)
     _check_counts(data, layout)

@@ -90,9 +90,9 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         name: of the recording where `meta` gives none.
         notes: of the reader; those that the log already has are not repeated.
     """
-    truth, contents = channels["truth"], meta.truth_channels
+    contents = meta.truth_channels
     if contents is None:
-        contents = () if truth is None else truth_contents(truth)
+        contents = truth_contents(channels["truth"])
     same = ("start_ns", "vehicle", "datum", "truth_frame", "metadata")
     stated: dict[str, Any] = {key: getattr(meta, key) for key in same}
     stated |= {key: getattr(meta, key) or "" for key in ("description", "licence", "source", "imu_frame_id")}
@@ -136,8 +136,10 @@ def _unknown_files(folder: Path) -> Iterator[str]:
         yield f"{path.name} is not a channel of the format and was not read{meant}"
 
 
-def truth_contents(truth: Trajectory) -> tuple[str, ...]:
+def truth_contents(truth: Trajectory | None) -> tuple[str, ...]:
     """Names of what a trajectory holds: position, yaw, orientation (more than yaw), velocity."""
+    if truth is None:
+        return ()
     found = ["position"]
     if truth.quaternion is not None:
         tilted = np.nanmax(np.abs(truth.quaternion[:, :2]), initial=0.0) > 0.0

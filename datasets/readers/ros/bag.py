@@ -168,7 +168,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         **others,
         truth=truth,
         datum=datum,
-        truth_channels=truth_contents(truth) if truth is not None else (),
+        truth_channels=truth_contents(truth),
         truth_frame=frame,
         overrides=with_mountings(Overrides(track_m=track), mounted, builder.rig),
         source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),

@@ -29,11 +29,8 @@ from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
-from terrafusion.datasets.readers.ros.streams import Stream, wanted_fields
+from terrafusion.datasets.readers.ros.streams import Key, Stream, wanted_fields
 from terrafusion.datasets.readers.timed_tables import TimedTable
-
-Key = tuple[str, str]
-"""Name and type of a topic."""
 
 PREFIX = "/terrafusion/"
 META: Key = (f"{PREFIX}meta", topics.STRING)

@@ -102,7 +102,7 @@ def read(request: Request) -> list[Recording]:
         wheels=Wheels(wheels.t_ns, wheels.value, Wheels.LAYOUTS[1], "mps") if wheels else None,
         steering=angle,
         datum=datum,
-        truth_channels=truth_contents(truth) if truth is not None else (),
+        truth_channels=truth_contents(truth),
         truth_frame="antenna",
         clock_jumps=tuple(jump for n, t in times.items() for jump in t.jumps_of([SIGNALS[n][1]])),
         notes=(*notes, *about_fixes, *about_imu, *(note for t in times.values() for note in t.notes)),

@@ -85,7 +85,7 @@ def read(request: Request) -> list[Recording]:
     joined = f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
     notes = [joined, *apart, *clock, *(note for r in rows.values() for note in r.notes)]
     truth, truth_notes = _truth(rows)
-    held = () if truth is None else truth_contents(truth)
+    held = truth_contents(truth)
     truth_kind = "center" if "center" in rows else "front"
     wheels, wheel_notes = _wheels(rows.get("wheels"), given.kind == "wheels")
     imu = rows.get("imu")

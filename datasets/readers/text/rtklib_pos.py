@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.clock import RowTimes
@@ -75,9 +74,11 @@ def read(request: Request) -> list[Recording]:
     notes += [*columns.notes, *times.notes]
     if b"/geodetic" in data[:4096] and header.kind != BASELINE:
         notes.append("gnss: heights are above the geoid; taken as they are")
-    solution = _Solution(columns, header, times)
-    fixes, base = solution.fixes(), solution.base()
-    return [gnss_recording(request, fixes, base, "RTKLIB solution", [*notes, *solution.notes], times)]
+    columns = columns.select(times.order)
+    fix = _fix(columns, notes)
+    fixes = _ecef(columns, fix, times) if header.kind == ECEF else _local(columns, fix, times, header.kind)
+    base = _base(header, notes) if header.kind == BASELINE else None
+    return [gnss_recording(request, fixes, base, "RTKLIB solution", notes, times)]
 
 
 def _is_row(head: bytes) -> bool:
@@ -101,7 +102,6 @@ def _header(data: bytes) -> PosHeader:
         mark = line[line.index(kind) + len(kind) :][:1]
         separator = mark if mark and not mark.isspace() else ("\t" if mark == "\t" else BLANKS)
         time_system, *names = split(line[1:].strip(), separator)
-        limits.check_columns(len(names))
         found = PosHeader(number, tuple(names), kind, separator, time_system, base)
     if found is None:
         raise DataError(
@@ -127,7 +127,7 @@ def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
     names: list[str] = []
     for name in header.names:
         names += [f"{name} {part}" for part in "dms"] if name in POSITIONS[DMS][:2] else [name]
-    if limits.repeated(names) or not set(POSITIONS[header.kind][1:]) <= set(header.names):
+    if not set(POSITIONS[header.kind][1:]) <= set(header.names):
         raise DataError("the line of column names is damaged", remedy="write the solution again")
     row = next((x for n, x in head_lines(data) if n > header.line and x.strip() and x[0] != "%"), "")
     cells = split(row, header.separator)
@@ -172,87 +172,71 @@ def _calendar_ns(columns: TextTable) -> TimesNs:
         raise columns.bad_cell("date", bad.row, "give YYYY/MM/DD HH:MM:SS.SSS") from None
 
 
-class _Solution:
-    """The rows of a file, in the order of their times."""
+def _fix(columns: TextTable, notes: list[str]) -> NDArray[np.uint8]:
+    """Classes (N,) of the fixes."""
+    if "Q" not in columns.numbers:
+        notes.append("gnss: the solution has no Q; all fixes are taken as 'single'")
+        return np.full(len(columns), Fix.SINGLE, dtype=np.uint8)
+    q = columns.numbers["Q"]
+    strange = np.flatnonzero(~np.isin(q, list(FIX_OF_Q)))
+    if strange.size:
+        raise DataError(
+            f"Q is {q[strange[0]]:g} at data row {int(strange[0]) + 1}",
+            remedy="known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP",
+        )
+    if (q == 6).any():
+        notes.append(f"gnss: {int((q == 6).sum())} PPP fixes are taken as 'float'")
+    return np.array([FIX_OF_Q[k] for k in range(7)], dtype=np.uint8)[q.astype(np.int64)]
 
-    def __init__(self, columns: TextTable, header: PosHeader, times: RowTimes) -> None:
-        self.columns, self.header, self.times = columns, header, times
-        self.notes: list[str] = []
-        self.fix = self._fix()
 
-    def stack(self, *names: str) -> Array:
-        return self.columns.stack(names)[self.times.order]
+def _base(header: PosHeader, notes: list[str]) -> Datum | None:
+    """Position of the base station of a baseline, where the file has it."""
+    base = header.base
+    if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
+        return base[0], base[1], base[2]
+    notes.append("gnss: baselines of a base station whose position is not in the file")
+    return None
 
-    def fixes(self) -> Fixes:
-        """The fixes in latitude and longitude, or along the axes of a baseline."""
-        return self._ecef() if self.header.kind == ECEF else self._along_axes(self.header.kind == BASELINE)
 
-    def base(self) -> Datum | None:
-        """Position of the base station of a baseline, where the file has it."""
-        base = self.header.base
-        if self.header.kind != BASELINE:
-            return None
-        if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
-            return base[0], base[1], base[2]
-        self.notes.append("gnss: baselines of a base station whose position is not in the file")
-        return None
+def _local(columns: TextTable, fix: NDArray[np.uint8], times: RowTimes, kind: str) -> Fixes:
+    """Fixes in latitude and longitude, or of a baseline; sigmas and velocities are east, north, up."""
+    place = columns.stack(POSITIONS[kind])
+    if kind == DMS:
+        *angles, height = POSITIONS[kind]
+        place = np.column_stack([*(_degrees(columns, name) for name in angles), columns.numbers[height]])
+    sigma = columns.stack(("sde(m)", "sdn(m)", "sdu(m)"))
+    velocity = columns.stack(("ve(m/s)", "vn(m/s)", "vu(m/s)"))
+    sigma_v = _horizontal(columns.stack(("sdve", "sdvn")))
+    return Fixes(times.t_ns, place, fix, sigma, velocity, sigma_v, local=kind == BASELINE)
 
-    def _along_axes(self, local: bool) -> Fixes:
-        """Fixes with sigmas and velocities along east, north and up."""
-        place = self.stack(*POSITIONS[BASELINE]) if local else self._llh()
-        sigma = self.stack("sde(m)", "sdn(m)", "sdu(m)")
-        velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")
-        sigma_v = _horizontal(self.stack("sdve", "sdvn"))
-        return Fixes(self.times.t_ns, place, self.fix, sigma, velocity, sigma_v, local)
 
-    def _llh(self) -> Array:
-        """Latitude and longitude (deg) and height (m), (N, 3)."""
-        *names, height = POSITIONS[self.header.kind]
-        if self.header.kind == DEGREES:
-            return self.stack(*names, height)
-        angles = []
-        for name in names:
-            degrees, minutes, seconds = self.stack(*(f"{name} {part}" for part in "dms")).T
-            sign = np.where(np.signbit(degrees), -1.0, 1.0)  # -0 degrees are south or west too
-            angles.append(sign * (np.abs(degrees) + minutes / 60.0 + seconds / 3600.0))
-        return np.column_stack([*angles, self.stack(height)[:, 0]])
+def _degrees(columns: TextTable, name: str) -> Array:
+    """An angle (N,) of its degrees, minutes and seconds; -0 degrees are south or west too."""
+    degrees, minutes, seconds = columns.stack([f"{name} {part}" for part in "dms"]).T
+    return np.asarray(np.copysign(np.abs(degrees) + minutes / 60.0 + seconds / 3600.0, degrees))
 
-    def _ecef(self) -> Fixes:
-        import pymap3d
 
-        xyz = self.stack(*POSITIONS[ECEF])
-        far = np.flatnonzero(~(np.abs(np.linalg.norm(xyz, axis=1) - 6.37e6) < 1e5))
-        if far.size:
-            i = int(far[0])
-            raise DataError(
-                f"the ECEF position {xyz[i, 0]:g}, {xyz[i, 1]:g}, {xyz[i, 2]:g} m is not near the ground",
-                channel="gnss",
-                time_s=float(self.times.t_ns[i] - self.times.t_ns[0]) * 1e-9,
-                remedy="process the observations again",
-            )
-        llh = np.stack(pymap3d.ecef2geodetic(*xyz.T), axis=1)
-        _, R, _ = enu_from_ecef(xyz[:1])  # one rotation: a robot stays near its first fix
-        velocity = self.stack("vx(m/s)", "vy(m/s)", "vz(m/s)") @ R.T
-        cross = self.stack("sdxy(m)", "sdyz(m)", "sdzx(m)")
-        P = _covariances(self.stack("sdx(m)", "sdy(m)", "sdz(m)"), cross)
-        V = _covariances(self.stack("sdvx", "sdvy", "sdvz"), self.stack("sdvxy", "sdvyz", "sdvzx"))
-        sigma, sigma_v = _sigmas(R @ P @ R.T), _horizontal(_sigmas(R @ V @ R.T)[:, :2])
-        return Fixes(self.times.t_ns, llh, self.fix, sigma, velocity, sigma_v)
+def _ecef(columns: TextTable, fix: NDArray[np.uint8], times: RowTimes) -> Fixes:
+    """Fixes of ECEF positions, whose sigmas and velocities are turned to east, north and up."""
+    import pymap3d
 
-    def _fix(self) -> NDArray[np.uint8]:
-        if "Q" not in self.columns.numbers:
-            self.notes.append("gnss: the solution has no Q; all fixes are taken as 'single'")
-            return np.full(len(self.times.t_ns), Fix.SINGLE, dtype=np.uint8)
-        q = self.stack("Q")[:, 0]
-        strange = np.flatnonzero(~np.isin(q, list(FIX_OF_Q)))
-        if strange.size:
-            raise DataError(
-                f"Q is {q[strange[0]]:g} at data row {int(strange[0]) + 1}",
-                remedy="known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP",
-            )
-        if (q == 6).any():
-            self.notes.append(f"gnss: {int((q == 6).sum())} PPP fixes are taken as 'float'")
-        return np.array([FIX_OF_Q[k] for k in range(7)], dtype=np.uint8)[q.astype(np.int64)]
+    xyz = columns.stack(POSITIONS[ECEF])
+    far = np.flatnonzero(~(np.abs(np.linalg.norm(xyz, axis=1) - 6.37e6) < 1e5))
+    if far.size:
+        i = int(far[0])
+        raise DataError(
+            f"the ECEF position {xyz[i, 0]:g}, {xyz[i, 1]:g}, {xyz[i, 2]:g} m is not near the ground",
+            channel="gnss",
+            time_s=float(times.t_ns[i] - times.t_ns[0]) * 1e-9,
+            remedy="process the observations again",
+        )
+    llh = np.stack(pymap3d.ecef2geodetic(*xyz.T), axis=1)
+    _, R, _ = enu_from_ecef(xyz[:1])  # one rotation: a robot stays near its first fix
+    velocity = columns.stack(("vx(m/s)", "vy(m/s)", "vz(m/s)")) @ R.T
+    P = _covariances(columns, ("sdx(m)", "sdy(m)", "sdz(m)"), ("sdxy(m)", "sdyz(m)", "sdzx(m)"))
+    V = _covariances(columns, ("sdvx", "sdvy", "sdvz"), ("sdvxy", "sdvyz", "sdvzx"))
+    sigma, sigma_v = _sigmas(R @ P @ R.T), _horizontal(_sigmas(R @ V @ R.T)[:, :2])
+    return Fixes(times.t_ns, llh, fix, sigma, velocity, sigma_v)
 
 
 def _horizontal(sigma: Array) -> Array:
@@ -260,12 +244,12 @@ def _horizontal(sigma: Array) -> Array:
     return np.asarray(np.sqrt((sigma**2).mean(axis=1)))
 
 
-def _covariances(sigma: Array, cross: Array) -> Array:
-    """Matrices (N, 3, 3) of sigmas (N, 3) and of RTKLIB's xy, yz, zx: the root of a covariance, signed."""
-    P = np.zeros((len(sigma), 3, 3))
-    P[:, range(3), range(3)] = sigma**2
-    for k, (i, j) in enumerate(((0, 1), (1, 2), (2, 0))):
-        P[:, i, j] = P[:, j, i] = np.sign(cross[:, k]) * cross[:, k] ** 2
+def _covariances(columns: TextTable, sigmas: tuple[str, ...], crosses: tuple[str, ...]) -> Array:
+    """Matrices (N, 3, 3) of sigmas and of RTKLIB's xy, yz, zx: the root of a covariance, signed."""
+    P = np.zeros((len(columns), 3, 3))
+    P[:, range(3), range(3)] = columns.stack(sigmas) ** 2
+    for (i, j), cross in zip(((0, 1), (1, 2), (2, 0)), columns.stack(crosses).T, strict=True):
+        P[:, i, j] = P[:, j, i] = np.sign(cross) * cross**2
     return P
 
 

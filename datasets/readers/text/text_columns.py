@@ -94,9 +94,6 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     elif comment and len(split(comment, separator)) == len(cells) and _is_row(cells):
         cells, first_line = split(comment, separator), number
     limits.check_columns(len(cells))
-    repeated = limits.repeated(name for name in cells if name)
-    if repeated:
-        raise DataError(f"column '{repeated}' comes twice", remedy="rename one of them")
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
@@ -117,16 +116,12 @@ def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
     number, line, settings = found
     separator = separator_of(line)
     raw = split(line, separator)
-    limits.check_columns(len(raw))
     if raw and not raw[-1]:
         raw.pop()
     names = [_bare(name) for name in raw]
     for full, name in zip(raw, names, strict=True):
         if full != name:
             settings[f"unit of {name}"] = full[len(name) :].strip(" []()")
-    repeated = limits.repeated(names)
-    if repeated:
-        raise DataError(f"column '{repeated}' comes twice", remedy="export it again")
     layout = TextLayout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
     attitudes = [name for group in ATTITUDES for name in group]
     wanted = {*COUNTERS, TICKS, *ACC, *GYR, *INCREMENTS[0], *INCREMENTS[1], *attitudes, *POSITION, *UTC}
