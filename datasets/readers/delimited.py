@@ -59,14 +59,6 @@ class TextLayout:
     time: str = ""
     strict: bool = False
 
-    def seconds(self, cells: Sequence[str]) -> float | None:
-        """The time of a row; None where it cannot be read."""
-        try:
-            seconds = float(cells[self.names.index(self.time)])
-        except (ValueError, IndexError):
-            return None
-        return seconds if np.isfinite(seconds) else None
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Columns:
@@ -264,56 +256,57 @@ def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tup
     long = len(data) - begin > limits.LINE_BYTES
     first = data.count(b"\n", 0, begin) + 1 < layout.first_line
     whole = long or first or len(split(last, layout.separator)) >= len(layout.names)
-    if cut or not whole:
-        return begin, (f"{path.name}: the last line was cut off and is left out{_end(data[:begin], layout)}",)
-    return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
-
-
-def _end(data: bytes, layout: TextLayout) -> str:
-    """At which line and time complete lines end, for a note."""
-    text = data[-limits.LINE_BYTES :].rstrip().rpartition(b"\n")[2].decode("utf-8", "replace")
-    at = f"; its data end in line {data.count(NEWLINE)}"
-    since_s = _since_s(data, layout, split(text, layout.separator))
-    return at if since_s is None else f"{at}, t = {since_s:.3f} s"
+    if not cut and whole:
+        return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
+    before = data[max(begin - limits.LINE_BYTES, 0) : begin].rstrip().rpartition(b"\n")[2]
+    since_s = _since_s(data[:begin], layout, split(before.decode("utf-8", "replace"), layout.separator))
+    until = "" if since_s is None else f", t = {since_s:.3f} s"
+    end = data.count(b"\n", 0, begin)
+    return begin, (
+        f"{path.name}: the last line was cut off and is left out; its data end in line {end}{until}",
+    )
 
 
 def _since_s(data: bytes, layout: TextLayout, cells: Sequence[str]) -> float | None:
     """Seconds of a row since 0, or since the first row; None where a time cannot be read."""
-    first = next(_rows(data, layout), (0, []))[1] if layout.time and not layout.strict else []
-    time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
-    return None if time_s is None or origin_s is None else time_s - origin_s
+    try:
+        at = layout.names.index(layout.time)
+        origin = 0.0 if layout.strict else float(next(_rows(data, layout), (0, []))[1][at])
+        since = float(cells[at]) - origin
+    except (ValueError, IndexError):
+        return None
+    return since if np.isfinite(since) else None
 
 
 def _check_counts(data: bytes, layout: TextLayout) -> None:
     """Refuse the first line that has not as many cells as there are columns."""
-    lines = _counts(data, layout)
-    if layout.separator != BLANKS and b'"' in data:
-        rows = _rows(data, layout)
-        lines = ((line, layout.separator.join(cells) or ".", len(cells)) for line, cells in rows)
-    for line, text, count in lines:
-        if count == len(layout.names) or line < layout.first_line or not text.strip():
-            continue
-        if layout.comment and text[0] == layout.comment:
-            continue
-        what = f"line {line} has {count} cells for {len(layout.names)} columns"
-        cells, remedy = split(text, layout.separator), "is it cut off, or of another table?"
+    width = len(layout.names)
+    for line, cells in _rows_of_other_width(data, layout, width):
+        what = f"line {line} has {len(cells)} cells for {width} columns"
+        remedy = "is it cut off, or of another table?"
         if layout.strict:
             remedy = "an unknown value is an empty cell between commas"
         raise _line_error(data, layout, what, cells, remedy)
 
 
+def _rows_of_other_width(data: bytes, layout: TextLayout, width: int) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of the rows that have not so many cells."""
+    mark = layout.separator.encode()
+    if layout.separator != BLANKS and b'"' in data:
+        yield from ((line, cells) for line, cells in _rows(data, layout) if len(cells) != width)
+        return
+    for number, line in enumerate(io.BytesIO(data), 1):  # no cell of these lines becomes an object
+        count = len(line.split()) if layout.separator == BLANKS else line.count(mark) + 1
+        if count == width or number < layout.first_line or not line.strip():
+            continue
+        text = line.decode("utf-8", "replace").rstrip("\n")
+        if not (layout.comment and text.startswith(layout.comment)):
+            yield number, text.split(None if layout.separator == BLANKS else layout.separator)
+
+
 def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
     return DataError(what, time_s=_since_s(data, layout, cells), remedy=remedy)
-
-
-def _counts(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    """Number, beginning and cells of each line."""
-    mark, width = layout.separator.encode(), len(layout.names)
-    for number, line in enumerate(io.BytesIO(data), 1):
-        count = len(line.split()) if layout.separator == BLANKS else line.count(mark) + 1
-        if count != width:
-            yield number, line[:500].decode("utf-8", "replace").rstrip("\n"), count
 
 
 def _parse(

@@ -159,6 +159,11 @@ class ColumnMap(ColumnMapFile):
         fields = (of.column for channel in self.channels.values() for of in channel.values())
         return list(dict.fromkeys([self.time.column, *fields]))
 
+    def words(self) -> set[str]:
+        """Names of the columns that hold words."""
+        fields = (field for channel in self.channels.values() for field in channel.items())
+        return {of.column for name, of in fields if name in TEXT_FIELDS}
+
 
 def read_column_map(path: Path) -> ColumnMap:
     """Read and check a column map.

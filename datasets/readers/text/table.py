@@ -51,9 +51,7 @@ SHOWN_COLUMNS = 60
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
-
 TableColumns = TextColumns | ParquetColumns
-"""A file's columns."""
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -87,12 +85,12 @@ def read(request: Request) -> list[Recording]:
         column_map = contract_map(columns.names)
         notes = ["columns are known by the log folder's names for them"]
     if column_map is None:
-        raise _mapless(path, columns.names, columns.first_cells() if isinstance(columns, TextColumns) else [])
+        raise _mapless(path, columns.names, columns.first_cells())
     for name in column_map.columns():
         if name not in columns.names:
             few = ", ".join(columns.names[:SHOWN_COLUMNS])
             raise DataError(f"there is no column '{name}'", remedy=f"the file has {few}")
-    columns.read(column_map.columns())
+    columns.read(column_map)
     return [_recording(request, columns, column_map, notes)]
 
 
@@ -122,8 +120,7 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
-    of_text = columns.notes if isinstance(columns, TextColumns) else ()
-    notes = [*notes, *time_notes, *of_text, *times.notes, *reader.notes]
+    notes = [*notes, *time_notes, *columns.notes, *times.notes, *reader.notes]
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))

@@ -13,7 +13,6 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
-    CutText,
     TextLayout,
     head_lines,
     read_columns,
@@ -21,7 +20,7 @@ from terrafusion.datasets.readers.delimited import (
     separator_of,
     split,
 )
-from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
+from terrafusion.datasets.readers.text.column_map import ColumnMap
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
@@ -38,27 +37,22 @@ class TextColumns:
 
     def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
-        self._map = column_map
-        self._data = read_text(path)
-        self._layout = _layout(self._data, column_map)
+        text = read_text(path)
+        self._layout = _layout(text, column_map)
+        self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
-        cut = isinstance(self._data, CutText)
-        self._data, self._commas = _with_points(self._data, self._layout)
-        self._data = CutText(self._data) if cut else self._data
-        self.notes: tuple[str, ...] = ()
+        self.notes: list[str] = []
 
-    def read(self, names: list[str]) -> None:
-        """Parse these columns: times and words as text, all others as numbers."""
-        texts = {self._map.time.column} if self._map else {"t_s", *(set(TEXT_FIELDS) & set(names))}
-        channels = self._map.channels.values() if self._map else ()
-        texts |= {of.column for fields in channels for name, of in fields.items() if name in TEXT_FIELDS}
-        numbers = [name for name in names if name not in texts]
-        self._table = read_columns(self.path, self._data, self._layout, numbers, sorted(texts))
-        self.notes = (*self._table.notes, *(["numbers have decimal commas"] if self._commas else []))
+    def read(self, column_map: ColumnMap) -> None:
+        """Parse the mapped columns: times and words as text, all others as numbers."""
+        texts = {column_map.time.column, *column_map.words()}
+        numbers = [name for name in column_map.columns() if name not in texts]
+        self._table = read_columns(self.path, self._text, self._layout, numbers, sorted(texts))
+        self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
 
     def first_cells(self) -> list[str]:
         """The cells of the first row; [] where there is none."""
-        return next(_sample(self._data, self._layout), [])
+        return next(_sample(self._text, self._layout), [])
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
@@ -114,7 +108,7 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     begin = 0
     for _ in range(layout.first_line - 1):
         begin = data.find(b"\n", begin) + 1
-    return data[:begin] + data[begin:].replace(b",", b"."), True
+    return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
 
 
 def _is_row(cells: list[str]) -> bool:
@@ -147,16 +141,20 @@ class ParquetColumns:
         except self._refused as error:
             raise self._damaged(error) from None
         self.names: list[str] = list(self._file.schema_arrow.names)
-        self.rows: int = self._file.metadata.num_rows
         limits.check_columns(len(self.names))
         if not self.names or len(set(self.names)) < len(self.names):
             raise DataError("has no columns, or two of one name", remedy="name each column once")
+        self.notes: list[str] = []
         self._table: Any = None
 
-    def read(self, names: list[str]) -> None:
-        """Read these columns; texts stay packed until they are asked for."""
-        size = self.path.stat().st_size
-        limits.check_table(self.rows, len(names), size)
+    def first_cells(self) -> list[str]:
+        """None: the kinds of the columns say what they hold."""
+        return []
+
+    def read(self, column_map: ColumnMap) -> None:
+        """Read the mapped columns; texts stay packed until they are asked for."""
+        names, size = column_map.columns(), self.path.stat().st_size
+        limits.check_table(self._file.metadata.num_rows, len(names), size)
         limits.check_expansion(self._stored_bytes(names), size)
         self._check_kinds(names)
         try:
