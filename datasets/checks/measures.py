@@ -227,19 +227,11 @@ def _whole(context: CheckContext, measured: MeasuredPath) -> PathFits | None:
 
 def _lags(context: CheckContext) -> Iterator[PairLag]:
     """Lags between the channels of `LAG_PAIRS` that are there."""
-    radius = context.wheel_radius_m() or 1.0
-    known = {
-        "yaw rate": motion.yaw_rates(context.recording, radius),
-        "speed": motion.speeds(context.recording, radius),
-    }
     for quantity, pairs in LAG_PAIRS.items():
-        signals = known[quantity]
-        for one, other in pairs:
-            if one not in signals or other not in signals:
-                continue
+        for (one, other), signals in motion.signal_pairs(context, {quantity: pairs}).items():
             # A command is followed with a delay: far off there is only the next step that is like it.
-            lag = (near_lag if one == "command" else far_lag)(signals[one], signals[other])
-            if lag is None or lag.r < LEAST_R or opposed(lag, signals[one], signals[other]):
+            lag = (near_lag if one == "command" else far_lag)(*signals)
+            if lag is None or lag.r < LEAST_R or opposed(lag, *signals):
                 continue
             late, low, high = float(lag.seconds), float(lag.low_s), float(lag.high_s)
             if late >= 0.0:

@@ -5,6 +5,7 @@ GNSS, truth and command. Each keeps its own clock. Pairs of channels that observ
 the command is not among them: the robot follows it with a delay.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -248,6 +249,8 @@ SensorPairs = dict[Pair, tuple[Signal, Signal]]
 
 YAW_PAIRS: tuple[Pair, ...] = (("imu", "wheels"), ("truth", "imu"))
 SPEED_PAIRS: tuple[Pair, ...] = (("truth", "wheels"), ("gnss", "wheels"), ("truth", "gnss"))
+SENSOR_PAIRS = {"yaw rate": YAW_PAIRS, "speed": SPEED_PAIRS}
+"""By the quantity in which two channels are compared."""
 LEAST_R = 0.7
 NEAR_S, FAR_S = 2.0, 20.0
 """Lags are searched within the first reach; where nothing correlates there, within the second."""
@@ -255,14 +258,11 @@ FAR_R = 0.87
 """Least correlation of a lag within the second reach."""
 
 
-def signal_pairs(context: CheckContext) -> SensorPairs:
-    """The signals of all pairs that the recording has."""
-    radius = context.wheel_radius_m() or 1.0
-    found = {}
-    for signals, pairs in (
-        (yaw_rates(context.recording, radius), YAW_PAIRS),
-        (speeds(context.recording, radius), SPEED_PAIRS),
-    ):
+def signal_pairs(context: CheckContext, wanted: Mapping[str, Sequence[Pair]] = SENSOR_PAIRS) -> SensorPairs:
+    """The signals of those pairs that the recording has."""
+    radius, found = context.wheel_radius_m() or 1.0, {}
+    for quantity, pairs in wanted.items():
+        signals = (yaw_rates if quantity == "yaw rate" else speeds)(context.recording, radius)
         for one, other in pairs:
             if one in signals and other in signals:
                 found[one, other] = signals[one], signals[other]

@@ -40,12 +40,11 @@ from terrafusion.datasets.readers.ros.static_frames import (
     tells_turn,
 )
 from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.timed_tables import fresh
 
 NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
-FIX_OF_STATUS = {1: Fix.DGPS, 2: Fix.FIXED}
 MOVING_MPS = 0.05
 SIDEWAYS_SHARE = 0.5
 """Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
@@ -279,7 +278,7 @@ class ChannelBuilder:
         """Fixes as ENU about `datum`, or about the first valid fix."""
         status = stream.column("status.status")
         fix = np.where(status >= 0, Fix.SINGLE, Fix.NONE).astype(np.uint8)
-        for number, fix_class in FIX_OF_STATUS.items():
+        for number, fix_class in FIX_OF_CODE["navsatfix"].items():
             fix[status == number] = fix_class
         fixes = Fixes(t_ns, self._llh(stream), fix, self._sigma(stream))
         rows = f"messages of {stream.topic}"

@@ -17,6 +17,7 @@ from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS
 from terrafusion.datasets.readers.log_meta import DescriptionFile, Meta, parse_meta
+from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE
 
 DEG = math.pi / 180.0
 
@@ -51,7 +52,7 @@ FIELDS["truth"] = (*FIELDS["truth"][:3], "yaw_rad", *FIELDS["truth"][3:])
 `terrain` also takes p_<class>."""
 
 TEXT_FIELDS = ("fix", "label")
-FIX_CODES = ("", "nmea", "rtklib", "navsatfix")
+FIX_CODES = ("", *FIX_OF_CODE)
 """What stands in a column for `fix`: words, or the codes of these (its unit)."""
 
 TIME_UNITS = (*NS_PER, "iso8601")

@@ -25,7 +25,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import assumed_sigma
 from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import Fixes, gnss_recording
+from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_recording
 from terrafusion.datasets.readers.timed_tables import row_times
 
 CHECKED_SENTENCE = re.compile(
@@ -39,11 +39,11 @@ ISO_STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?")
 
 KNOT_MPS = 1852.0 / 3600.0
 DAY_NS = 86400 * 10**9
-FIX_OF_QUALITY = {0: Fix.NONE, 1: Fix.SINGLE, 2: Fix.DGPS, 3: Fix.SINGLE, 4: Fix.FIXED, 5: Fix.FLOAT}
-"""GGA: 1 GPS, 2 differential, 3 PPS, 4 RTK, 5 float RTK; no fixes are 6 estimated, 7 manual, 8 simulated."""
+FIX_OF_QUALITY = FIX_OF_CODE["nmea"]
+NO_FIX = (6, 7, 8)
+"""Qualities of GGA: estimated, manual, simulated."""
 FIX_OF_MODE = dict.fromkeys(("A", "P", ""), Fix.SINGLE) | {"D": Fix.DGPS, "R": Fix.FIXED, "F": Fix.FLOAT}
 """RMC, from NMEA 2.3 on; E, M, S and N are no fixes."""
-NO_FIX = (6, 7, 8)
 NEAR_EPOCHS = 3
 """Sentences of an epoch may come this many epochs late."""
 CENTURY, CENTURIES_END = 80, 2200

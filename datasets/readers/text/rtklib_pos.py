@@ -28,7 +28,7 @@ from terrafusion.datasets.readers.delimited import (
     split,
 )
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_recording
+from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Datum, Fixes, gnss_recording
 from terrafusion.datasets.readers.timed_tables import row_times
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
@@ -41,8 +41,7 @@ POSITIONS = {
 TIME_SYSTEMS = ("GPST", "UTC", "JST")
 JST_AHEAD_NS = 9 * 3600 * 10**9
 
-FIX_OF_Q = {0: Fix.NONE, 1: Fix.FIXED, 2: Fix.FLOAT, 3: Fix.DGPS, 4: Fix.DGPS, 5: Fix.SINGLE, 6: Fix.FLOAT}
-"""Q: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP (taken as float)."""
+FIX_OF_Q = FIX_OF_CODE["rtklib"]
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,7 @@ def _fix(columns: TextTable, notes: list[str]) -> NDArray[np.uint8]:
         )
     if (q == 6).any():
         notes.append(f"gnss: {int((q == 6).sum())} PPP fixes are taken as 'float'")
-    return np.array([FIX_OF_Q[k] for k in range(7)], dtype=np.uint8)[q.astype(np.int64)]
+    return np.array([*FIX_OF_Q.values()], dtype=np.uint8)[q.astype(np.int64)]
 
 
 def _base(header: PosHeader, notes: list[str]) -> Datum | None:

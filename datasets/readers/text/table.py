@@ -35,18 +35,13 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
     units_of,
 )
-from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
+from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
 from terrafusion.datasets.readers.timed_tables import TimedTable, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 
-FIX_WORDS = {
-    "nmea": {0: "none", 1: "single", 2: "dgps", 3: "single", 4: "fixed", 5: "float", 6: "none"},
-    "rtklib": {0: "none", 1: "fixed", 2: "float", 3: "dgps", 4: "dgps", 5: "single", 6: "float"},
-    "navsatfix": {-1: "none", 0: "single", 1: "dgps", 2: "fixed"},
-}
 SHOWN_COLUMNS = 60
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
@@ -186,7 +181,7 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     if name != "fix" or not of.unit:
         return texts
     words, inverse = distinct(texts)
-    codes = FIX_WORDS[of.unit]
+    codes = {code: fix.name.lower() for code, fix in FIX_OF_CODE[of.unit].items()}
     meanings = [codes.get(_whole(word), "") for word in words]
     for word, meant in zip(words, meanings, strict=True):
         if word.strip() and not meant:
