@@ -76,8 +76,7 @@ def _piles_up(values: Array, top: float, count: int) -> bool:
 
 def check_spikes(context: CheckContext) -> Iterator[Finding]:
     """Single samples far from those before and after."""
-    masks: dict[str, Mask] = {}
-    largest: dict[str, tuple[float, str, int]] = {}
+    spikes: dict[str, list[tuple[str, Array]]] = {}
     for sensor in sensors_of(context.recording):
         if len(sensor.t_ns) < 4 * NEAR_ROWS:
             continue
@@ -86,21 +85,19 @@ def check_spikes(context: CheckContext) -> Iterator[Finding]:
         floor = max(least, rate * float(np.median(np.diff(sensor.t_ns))) * 1e-9) / unit
         for k in sensor.known():
             size = _spike_sizes(sensor.values[:, k], floor)
-            if not size.any():
-                continue
-            row = int(np.argmax(size))
-            masks[sensor.channel] = masks.get(sensor.channel, np.zeros(len(size), dtype=bool)) | (size > 0.0)
-            if size[row] > largest.get(sensor.channel, (0.0, "", 0))[0]:
-                largest[sensor.channel] = float(size[row]), sensor.names[k], row
-    for channel, mask in masks.items():
+            if size.any():
+                spikes.setdefault(sensor.channel, []).append((sensor.names[k], size))
+    for channel, axes in spikes.items():
+        mask = np.any([size > 0.0 for _, size in axes], axis=0)
         if mask.mean() > MOST_SPIKES:
             continue
-        worst, name, row = largest[channel]
+        name, size = max(axes, key=lambda axis: float(axis[1].max()))
+        row = int(np.argmax(size))
         at_s = context.since_start_s(getattr(context.recording, channel).t_ns[row])
         yield Finding(
             "spikes", "warning", channel,
             f"{counted(int(mask.sum()), 'spike')} of one sample",
-            f"largest {worst:.3g} off its neighbours, {name} at t = {at_s:.2f} s",
+            f"largest {size[row]:.3g} off its neighbours, {name} at t = {at_s:.2f} s",
             "leave these samples out",
             without_rows(channel, mask),
         )  # fmt: skip

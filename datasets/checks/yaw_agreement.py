@@ -7,6 +7,7 @@ Where courses are too coarse to say, the path of the fixes is compared with its 
 from collections.abc import Iterator
 from functools import partial
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,30 +25,30 @@ Agreements = dict[tuple[str, str], motion.Agreement]
 Signs = dict[tuple[str, str], float]
 """By pair of yaw sources 1 where they turn alike, -1 where they turn against each other."""
 
-SUSPECTS = ("gyro", "wheels", "gnss", "truth", "command", "accelerometer")
-"""Yaw sources in the order in which they are suspected where the data leave it open."""
+
+class YawSource(NamedTuple):
+    """How findings name a source of yaw rates, and the channel, code and severity of one on its sign."""
+
+    label: str
+    channel: str
+    code: str
+    severity: str
+
+
+SOURCES = {
+    "gyro": YawSource("gyro z", "imu", "yaw-sign", "error"),
+    "wheels": YawSource("the wheels", "wheels", "wheel-swap", "error"),
+    "gnss": YawSource("the path of the fixes", "gnss", "gnss-course", "error"),
+    "truth": YawSource("the truth's yaw", "truth", "truth-turns", "warning"),
+    "command": YawSource("the command", "command", "command-sign", "warning"),
+    "accelerometer": YawSource("the specific force in turns", "imu", "accel-mirrored", "warning"),
+}
+"""In the order in which they are suspected where the data leave it open."""
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
 """Limits of gyro rate over another source's. In rad/s it is the inverse track (0.3 to 4 1/m) or 1."""
 UNRELATED_R, LIVELY, MANY = 0.3, 0.05, 40
 FINE_S, REACH_S, LATE_GAIN = 0.1, 5.0, 0.1
 """Step and reach of the search for a delay; how much better it must correlate than a changed sign."""
-NAMES = {
-    "gyro": "gyro z",
-    "wheels": "the wheels",
-    "gnss": "the path of the fixes",
-    "truth": "the truth's yaw",
-    "command": "the command",
-    "accelerometer": "the specific force in turns",
-}
-CHANNELS = {"gyro": "imu", "accelerometer": "imu"}
-CODES = {
-    "gyro": "yaw-sign",
-    "wheels": "wheel-swap",
-    "gnss": "gnss-course",
-    "truth": "truth-turns",
-    "command": "command-sign",
-    "accelerometer": "accel-mirrored",
-}
 
 
 def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
@@ -57,10 +58,11 @@ def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
         both = found.get(("gyro", other))
         if both is None or not both.is_significant() or abs(both.slope) < limit:
             continue
-        unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {NAMES[other]}"
+        label = SOURCES[other].label
+        unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {label}"
         yield Finding(
             "gyro-in-degrees", "error", "imu",
-            f"gyro z is far larger than the turn rate of {NAMES[other]}: it looks like deg/s",
+            f"gyro z is far larger than the turn rate of {label}: it looks like deg/s",
             f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
             "multiply by pi / 180",
             scaled("imu", np.pi / 180.0, "gyro_radps"),
@@ -80,7 +82,7 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
         one, other = against[0]
         yield Finding(
             "yaw-contradiction", "warning", "imu",
-            f"{NAMES[one]} {_verb(one)} against {NAMES[other]}",
+            f"{SOURCES[one].label} {_verb(one)} against {SOURCES[other].label}",
             _evidence(against, signs, found) + "; no single sign explains all",
             "check the axes and signs of all of them",
         )  # fmt: skip
@@ -92,18 +94,16 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
         if not pairs or (name == "gyro" and not is_upright(context)):
             continue  # an IMU that is not upright: see imu.check_axes
         fix, repair = _remedy(context, name)
-        other = next(one for one in pairs[0] if one != name)
+        source, other = SOURCES[name], next(SOURCES[one].label for one in pairs[0] if one != name)
         if len(blamed) > 1:
-            fix += f" (assumed: no third source shows whether {NAMES[name]} or {NAMES[other]} is wrong)"
+            fix += f" (assumed: no third source shows whether {source.label} or {other} is wrong)"
         yield Finding(
-            CODES[name],
-            "error" if name in ("gyro", "wheels", "gnss") else "warning",
-            CHANNELS.get(name, name),
-            f"{NAMES[name]} {_verb(name)} against {NAMES[other]}",
+            source.code, source.severity, source.channel,
+            f"{source.label} {_verb(name)} against {other}",
             _evidence(pairs, signs, found),
             fix,
             repair,
-        )
+        )  # fmt: skip
 
 
 def check_unrelated(context: CheckContext) -> Iterator[Finding]:
@@ -132,10 +132,10 @@ def _agreements(context: CheckContext) -> Agreements:
 
 @once
 def agreements(context: CheckContext) -> Agreements:
-    """Agreement of every pair of yaw sources that can be compared, in the order of `SUSPECTS`."""
+    """Agreement of every pair of yaw sources that can be compared, in the order of `SOURCES`."""
     known = motion.yaw_angles(context)
     found: dict[tuple[str, str], motion.Agreement | None] = {}
-    for one, other in combinations(SUSPECTS, 2):
+    for one, other in combinations(SOURCES, 2):
         if one in known and other in known:
             window_s = motion.TRUTH_WINDOW_S if "truth" in (one, other) else motion.WINDOW_S
             found[one, other] = motion.agreement(known[one], known[other], window_s)
@@ -154,7 +154,7 @@ def contradictors(signs: Signs) -> list[frozenset[str]]:
     One set: the data determine who is wrong. Several: the first is the most suspect.
     [frozenset()]: no contradiction.
     """
-    names = [name for name in SUSPECTS if any(name in pair for pair in signs)]
+    names = [name for name in SOURCES if any(name in pair for pair in signs)]
     consistent = []
     for flips in product((1.0, -1.0), repeat=len(names)):
         sign = dict(zip(names, flips, strict=True))
@@ -162,7 +162,7 @@ def contradictors(signs: Signs) -> list[frozenset[str]]:
             consistent.append(frozenset(name for name in names if sign[name] < 0.0))
     fewest = min((len(flipped) for flipped in consistent), default=0)
     smallest = [flipped for flipped in consistent if len(flipped) == fewest]
-    return sorted(smallest, key=lambda flipped: sorted(SUSPECTS.index(name) for name in flipped))
+    return sorted(smallest, key=lambda flipped: [name not in flipped for name in SOURCES])
 
 
 def _signs(context: CheckContext, found: Agreements) -> Signs:
@@ -199,7 +199,11 @@ def _verb(name: str) -> str:
 
 
 def _evidence(pairs: list[tuple[str, str]], signs: Signs, found: Agreements) -> str:
-    parts = [f"correlation {found[p].r:.2f} of {NAMES[p[0]]} and {NAMES[p[1]]}" for p in pairs if p in found]
+    parts = [
+        f"correlation {found[one, other].r:.2f} of {SOURCES[one].label} and {SOURCES[other].label}"
+        for one, other in pairs
+        if (one, other) in found
+    ]
     turn = signs.get(("gyro", "accelerometer"), 0.0)
     if turn:
         parts.append(f"the specific force in turns {'agrees with' if turn > 0.0 else 'contradicts'} gyro z")

@@ -39,9 +39,9 @@ from terrafusion.datasets.core.wrapped_angles import (
     unwrapped_alone,
     unwrapped_beside_speeds,
 )
-from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
+from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_text
 from terrafusion.datasets.readers.log_meta import Meta
-from terrafusion.datasets.readers.timed_tables import TimedTable
+from terrafusion.datasets.readers.timed_tables import TimedTable, read_timed
 
 MAX_T_S = 1e9
 """A |t_s| beyond this (32 years) is a Unix time, not seconds from the start."""
@@ -77,13 +77,12 @@ def read_table(path: Path, known: ChannelColumns) -> TimedTable:
         layout = TextLayout(tuple(header), ",", 2, time="t_s", strict=True)
         words = [name for name in header if name in known.texts]
         numbers = [name for name in header if name not in (*words, "t_s")]
-        table = read_columns(path, data, layout, numbers, ["t_s", *words])
-        t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
-        far = np.flatnonzero(np.abs(t_ns) > int(MAX_T_S) * 10**9)
+        table = read_timed(path, data, layout, numbers, words)
+        far = np.flatnonzero(np.abs(table.t_ns) > int(MAX_T_S) * 10**9)
         if far.size:
-            what = f"t_s is {t_ns[far[0]] * 1e-9:.9g}, which looks like Unix time"
+            what = f"t_s is {table.t_ns[far[0]] * 1e-9:.9g}, which looks like Unix time"
             raise DataError(what, remedy="t_s must be seconds from start_ns of meta.yaml")
-    return TimedTable.of_text(table, words, t_ns, path)
+    return table
 
 
 def _header(data: bytes, known: ChannelColumns) -> list[str]:

@@ -89,7 +89,7 @@ class TextTable(Columns):
     layout: TextLayout
     data: bytes
 
-    def times_ns(self, name: str, unit: str = "s", remedy: str = "") -> TimesNs:
+    def times_ns(self, name: str, unit: str = "s") -> TimesNs:
         """A text column of decimal times as nanoseconds (N,).
 
         Raises:
@@ -98,7 +98,7 @@ class TextTable(Columns):
         try:
             return to_ns(self.texts[name].tolist(), unit)
         except NotADecimal as bad:
-            raise self.bad_cell(name, bad.row, remedy or f"give a time in {unit}") from None
+            raise self.bad_cell(name, bad.row, f"give every row its time in {unit}") from None
 
     def line(self, row: int) -> tuple[int, list[str]]:
         """Number, from 1, and cells of the line of a data row (from 0)."""

@@ -44,22 +44,6 @@ class TimedTable(Columns):
     rows: NDArray[np.int64] | None = None
     start_ns: int = 0
 
-    @classmethod
-    def of_text(
-        cls, text: TextTable, words: Sequence[str], t_ns: TimesNs, path: Path, start_ns: int = 0
-    ) -> Self:
-        """The table of a text's numbers and `words`, with the times (N,) of its rows."""
-        return cls(
-            numbers=text.numbers,
-            texts={name: text.texts[name] for name in words},
-            notes=text.notes,
-            t_ns=t_ns,
-            path=path,
-            text=text,
-            rows=np.arange(len(t_ns)),
-            start_ns=start_ns,
-        )
-
     def __len__(self) -> int:
         return len(self.t_ns)
 
@@ -75,6 +59,24 @@ class TimedTable(Columns):
         if self.text is not None and self.rows is not None:
             place = f"line {self.text.line(int(self.rows[row]))[0]}"
         return DataError(f"{place}: {what}", file=self.path, channel=channel, time_s=time_s, remedy=remedy)
+
+
+def read_timed(
+    path: Path, data: bytes, layout: TextLayout, numbers: Sequence[str], words: Sequence[str] = ()
+) -> TimedTable:
+    """As `read_columns`, with the times (s) of the column `layout.time`; those in errors count as it says."""
+    text = read_columns(path, data, layout, numbers, [layout.time, *words])
+    t_ns = text.times_ns(layout.time)
+    return TimedTable(
+        numbers=text.numbers,
+        texts={name: text.texts[name] for name in words},
+        notes=text.notes,
+        t_ns=t_ns,
+        path=path,
+        text=text,
+        rows=np.arange(len(t_ns)),
+        start_ns=0 if layout.strict else int(t_ns[0]),
+    )
 
 
 def read_rows(
@@ -96,12 +98,12 @@ def read_rows(
         data = read_text(path)
         names = _header(data, columns, separator) if header else tuple(columns)
         layout = TextLayout(names, separator, 2 if header else 1, comment, columns[0])
-        text = read_columns(path, data, layout, columns[1:], texts=columns[:1])
-        t_ns = text.times_ns(columns[0])
-        missing = np.argwhere(np.isnan(text.stack(columns[1:])))
-        if missing.size:
-            raise text.bad_cell(columns[int(missing[0, 1]) + 1], int(missing[0, 0]), "give a finite number")
-    return TimedTable.of_text(text, (), t_ns, path, start_ns=int(t_ns[0]))
+        table = read_timed(path, data, layout, columns[1:])
+        missing = np.argwhere(np.isnan(table.stack(columns[1:])))
+        if missing.size and table.text is not None:
+            row, k = missing[0].tolist()
+            raise table.text.bad_cell(columns[k + 1], row, "give a finite number")
+    return table
 
 
 def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, ...]:

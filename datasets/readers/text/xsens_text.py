@@ -44,7 +44,7 @@ POSITION = ("Latitude", "Longitude", "Altitude")
 VELOCITIES = (("Vel_X", "Vel_Y", "Vel_Z"), ("Vel_E", "Vel_N", "Vel_U"))
 STATUS = ("StatusWord", "Status")
 OTHER_DEVICES = ("Euler_X", "dq_W", "dv[1]")
-"""TextTable of Xsens DOT exports, whose units differ (us, deg/s)."""
+"""Columns of Xsens DOT exports, whose units differ (us, deg/s)."""
 
 ENU_OF = {"ENU": (0, 1, 2), "NED": (1, 0, 2), "NWU": (1, 0, 2)}
 ENU_SIGNS = {"ENU": (1, 1, 1), "NED": (1, 1, -1), "NWU": (-1, 1, 1)}
