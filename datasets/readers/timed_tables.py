@@ -146,7 +146,7 @@ def in_time(
     return out, jumps, [note for own in found.values() for note in own.notes]
 
 
-def fresh(t_ns: TimesNs) -> Mask:
+def new_times(t_ns: TimesNs) -> Mask:
     """Mask (N,) of the rows that do not repeat the time of the row before."""
     return np.diff(t_ns, prepend=t_ns[:1] - 1) > 0
 

@@ -41,7 +41,7 @@ from terrafusion.datasets.readers.ros.static_frames import (
 )
 from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Datum, Fixes, gnss_channel
-from terrafusion.datasets.readers.timed_tables import fresh
+from terrafusion.datasets.readers.timed_tables import new_times
 
 NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
@@ -352,7 +352,7 @@ class ChannelBuilder:
         twist = self._truth_twist(stream)
         child = str(stream.column("child_frame_id")[0]) if stream.has("child_frame_id") else ""
         frame = "antenna" if any(word in child.lower() for word in ("antenna", "gps", "gnss")) else "base"
-        once = fresh(t_ns)
+        once = new_times(t_ns)
         if not once.all():
             self.notes.append(f"truth: {int((~once).sum())} poses with a repeated time left out")
         others = (None if column is None else column[once] for column in (orientation, twist, covariance))

@@ -1,6 +1,6 @@
 """Raw messages of a bag, whatever its container: their sources, and where their bytes are.
 
-A container (`ros1`, `mcap_file`, `db3_file`) lists its `BagSource`s and yields `MessageBatch`es: the bytes
+A container (in `ros1`, `mcap_file`, `ros2`) lists its `BagSource`s and yields `MessageBatch`es: the bytes
 of a chunk and the places of one source's messages in it. No message becomes a Python object.
 """
 

@@ -37,6 +37,9 @@ from terrafusion.datasets.readers.ros.raw import (
     zstd,
 )
 
+METADATA = "metadata.yaml"
+SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
+REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 FETCHED_ROWS = 2048
 """Messages that are fetched at once."""
@@ -174,12 +177,7 @@ def _page_and_cut(path: Path) -> tuple[int, str]:
     return page, "its recorder did not close it" if _changes(path) else ""
 
 
-METADATA = "metadata.yaml"
-SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
 STORAGES: dict[str, type[McapFile] | type[Db3File]] = {"mcap": McapFile, "sqlite3": Db3File}
-
-
-REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
 
 
 def claims(path: Path, head: bytes) -> bool:

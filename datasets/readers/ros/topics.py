@@ -73,6 +73,12 @@ _NAMED = {"truth": _TRUTH, "datum": _DATUM, "terrain": _TERRAIN, "command": _COM
 _RAW = re.compile(r"raw", re.IGNORECASE)
 _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
 
+MOST_SHOWN = 8
+_NEVER = re.compile(
+    r"^(tf2|rcl_interfaces|rosgraph|diagnostic|visualization|rosbag2)_?\w*/|Image|PointCloud|Log$"
+)
+_LIKELY = re.compile(r"wheel|vel|speed|motor|enc|tick|rpm|odo|drive", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class BagTopic:
@@ -216,13 +222,6 @@ def _rank(kind: str, topic: BagTopic) -> tuple[int, bool, bool, int, str]:
     order = TYPES[kind].index(topic.msgtype)
     unpreferred = kind == "wheels" and not _PREFERRED_WHEEL.search(topic.name)
     return order, unpreferred, bool(_RAW.search(topic.name)), -topic.count, topic.name
-
-
-MOST_SHOWN = 8
-_NEVER = re.compile(
-    r"^(tf2|rcl_interfaces|rosgraph|diagnostic|visualization|rosbag2)_?\w*/|Image|PointCloud|Log$"
-)
-_LIKELY = re.compile(r"wheel|vel|speed|motor|enc|tick|rpm|odo|drive", re.IGNORECASE)
 
 
 def wheel_advice(

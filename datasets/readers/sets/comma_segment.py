@@ -22,7 +22,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import META, truth_contents
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
-from terrafusion.datasets.readers.timed_tables import fresh, row_times
+from terrafusion.datasets.readers.timed_tables import new_times, row_times
 
 MAGIC = b"\x93NUMPY"
 LOG, POSE = "processed_log", "global_pose"
@@ -224,5 +224,5 @@ def _truth(
     enu, R_enu_ecef, datum = enu_from_ecef(position, datum)
     R_ecef_camera = quaternion_to_matrix(orientation[:, [1, 2, 3, 0]])
     quaternion = matrix_to_quaternion(R_enu_ecef @ R_ecef_camera @ FORWARD_LEFT_UP)
-    once = fresh(t_ns)
+    once = new_times(t_ns)
     return Trajectory(t_ns[once], enu[once], quaternion[once]), datum

@@ -42,6 +42,14 @@ SMOOTH_M = 0.1
 SIGMA_FIXED_M, SIGMA_SINGLE_M = (0.01, 0.01, 0.02), (2.5, 2.5, 5.0)
 """East, north, up, where the file has none: what receivers' data sheets promise."""
 
+_CLASSES = ((Fix.FIXED, 0.05), (Fix.FLOAT, 0.5), (Fix.DGPS, 1.0), (Fix.SINGLE, np.inf))
+"""Fix class by the median horizontal sigma below, m; infinite sigmas are single points."""
+MAGIC = b"\x89HDF\r\n\x1a\n"
+USER_BLOCK = 512
+"""Bytes of text that MATLAB puts before the HDF5."""
+CLASS = "MATLAB_class"
+"""Attribute of each variable."""
+
 Placed = tuple[Array | None, list[str]]
 
 
@@ -229,17 +237,6 @@ def fix_class_and_sigma(file: MatlabFile, enu_m: Array) -> tuple[Fix, Array, str
         f"{level[2]:g} m in height, because 99 % of the second differences stay below {roughness:.2f} m"
     )
     return fix, np.tile(level, (len(enu_m), 1)), why
-
-
-_CLASSES = ((Fix.FIXED, 0.05), (Fix.FLOAT, 0.5), (Fix.DGPS, 1.0), (Fix.SINGLE, np.inf))
-"""Fix class by the median horizontal sigma below, m; infinite sigmas are single points."""
-
-
-MAGIC = b"\x89HDF\r\n\x1a\n"
-USER_BLOCK = 512
-"""Bytes of text that MATLAB puts before the HDF5."""
-CLASS = "MATLAB_class"
-"""Attribute of each variable."""
 
 
 def variables(path: Path) -> set[str] | None:

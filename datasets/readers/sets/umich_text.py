@@ -20,7 +20,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.timed_tables import TimedTable, are_numbers, fresh, in_time, read_rows
+from terrafusion.datasets.readers.timed_tables import TimedTable, are_numbers, in_time, new_times, read_rows
 
 POSE = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 COLUMNS = {
@@ -197,7 +197,7 @@ def _trajectory(rows: TimedTable) -> tuple[Trajectory, list[str]]:
         remedy = "are the columns t, x, y, z, qx, qy, qz, qw?"
         raise rows.error(row, f"the quaternion has length {norm[row]:.3f}, not 1", remedy)
     notes = []
-    once = fresh(rows.t_ns)
+    once = new_times(rows.t_ns)
     if not once.all():
         notes.append(f"{int((~once).sum())} rows repeat a time; only the first of each is used")
         rows = rows.select(once)

@@ -49,6 +49,31 @@ NEAR_EPOCHS = 3
 CENTURY, CENTURIES_END = 80, 2200
 """Two-digit years from the first on are of the 1900s; GPS begins in 1980, 64 bits of ns end in 2262."""
 UNKNOWN = (math.nan, math.nan, math.nan)
+SENTENCE = re.compile(rb"\$(?:G[PNLABQI]|BD|QZ|IN)(?:GGA|RMC|GST|ZDA|VTG|GLL|GSA|GSV),")
+WEEKS_1024_DAYS = 1024 * 7
+UNKNOWN_HDOP = 99.0
+"""Receivers write 99.99 where they have none."""
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether the name ends in .nmea, or a sentence of a GNSS receiver stands in the first bytes."""
+    return (path.suffix.lower() == ".nmea" and bool(head)) or bool(SENTENCE.search(head))
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a log: its GNSS channel."""
+    path = request.path
+    if path.stat().st_size > limits.TEXT_BYTES:
+        raise limits.too_much("MB", limits.TEXT_BYTES / 2**20)
+    data = path.read_bytes()
+    check_lines(data)
+    epochs, notes = collect(data.decode("latin-1"))
+    t_ns, date_notes = _dated(epochs)
+    times = row_times(request, "gnss", t_ns)
+    fixes, more = _fixes(request, epochs, t_ns)
+    fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
+    notes += [*date_notes, *times.notes, *more]
+    return [gnss_recording(request, fixes, None, "NMEA 0183 log", notes, times)]
 
 
 class _NoTimeError(Exception):
@@ -266,33 +291,6 @@ def _receipt_s(text: str, at: int) -> float:
         return datetime.fromisoformat(iso[0]).replace(tzinfo=UTC).timestamp() if iso else math.nan
     except ValueError:
         return math.nan
-
-
-SENTENCE = re.compile(rb"\$(?:G[PNLABQI]|BD|QZ|IN)(?:GGA|RMC|GST|ZDA|VTG|GLL|GSA|GSV),")
-WEEKS_1024_DAYS = 1024 * 7
-UNKNOWN_HDOP = 99.0
-"""Receivers write 99.99 where they have none."""
-
-
-def claims(path: Path, head: bytes) -> bool:
-    """Whether the name ends in .nmea, or a sentence of a GNSS receiver stands in the first bytes."""
-    return (path.suffix.lower() == ".nmea" and bool(head)) or bool(SENTENCE.search(head))
-
-
-def read(request: Request) -> list[Recording]:
-    """The one recording of a log: its GNSS channel."""
-    path = request.path
-    if path.stat().st_size > limits.TEXT_BYTES:
-        raise limits.too_much("MB", limits.TEXT_BYTES / 2**20)
-    data = path.read_bytes()
-    check_lines(data)
-    epochs, notes = collect(data.decode("latin-1"))
-    t_ns, date_notes = _dated(epochs)
-    times = row_times(request, "gnss", t_ns)
-    fixes, more = _fixes(request, epochs, t_ns)
-    fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
-    notes += [*date_notes, *times.notes, *more]
-    return [gnss_recording(request, fixes, None, "NMEA 0183 log", notes, times)]
 
 
 def _column(epochs: list[Epoch], name: str) -> NDArray[Any]:

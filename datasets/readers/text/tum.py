@@ -10,7 +10,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.delimited import BLANKS, head_lines
 from terrafusion.datasets.readers.formats import HEAD_BYTES, Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.timed_tables import fresh, in_time, read_rows
+from terrafusion.datasets.readers.timed_tables import in_time, new_times, read_rows
 
 COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 NORM_TOLERANCE = 0.01
@@ -44,7 +44,7 @@ def read(request: Request) -> list[Recording]:
         norm = np.linalg.norm(rows.stack(COLUMNS[4:])[off[0]])
         remedy = "give unit quaternions x, y, z, w"
         raise rows.error(int(off[0]), f"the quaternion has norm {norm:.3g}", remedy, "truth")
-    once = fresh(rows.t_ns)
+    once = new_times(rows.t_ns)
     if not once.all():
         notes.append(f"truth: {int((~once).sum())} poses with a repeated time left out")
     known = len(rows) == 1 or bool(rows.stack(COLUMNS[4:7]).any())
