@@ -110,17 +110,18 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
     if mean is None or is_metric(mean):
         return
     size = float(np.linalg.norm(mean))
-    code, what = "accel-magnitude", f"mean specific force is {size:.2f} m/s2, not 9.8"
-    fix = "give raw accelerometer data in m/s2, gravity included"
-    repair: Repair | None = None
     if 0.85 < size < 1.15:
-        code, what = "accel-in-g", "acceleration looks like g, not m/s2"
-        fix, repair = f"multiply by {GRAVITY_MPS2}", scaled("imu", GRAVITY_MPS2, "accel_mps2")
-    elif size < REMOVED_SHARE * GRAVITY_MPS2:
+        what, fix = "acceleration looks like g, not m/s2", f"multiply by {GRAVITY_MPS2}"
+        repair = scaled("imu", GRAVITY_MPS2, "accel_mps2")
+        yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
+        return
+    what = f"mean specific force is {size:.2f} m/s2, not 9.8"
+    fix, emptied = "give raw accelerometer data in m/s2, gravity included", None
+    if size < REMOVED_SHARE * GRAVITY_MPS2:
         what += ": gravity has been removed"
         fix = f"leave the accelerometer out (better: {fix})"
-        repair = changed_field("imu", "accel_mps2", lambda accel: np.full_like(accel, np.nan))
-    yield Finding(code, "error", "imu", what, _mean_force(mean), fix, repair)
+        emptied = changed_field("imu", "accel_mps2", lambda accel: np.full_like(accel, np.nan))
+    yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix, emptied)
 
 
 def check_bias(context: CheckContext) -> Iterator[Finding]:

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, with_fields
 from terrafusion.datasets.checks.motion import on_plane, seconds, typical_sigma, wheel_speed
 from terrafusion.datasets.checks.path import fit_windows, path_by
+from terrafusion.datasets.core.arrays import Complex
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
@@ -133,7 +133,7 @@ def check_frame(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _moved_onto(points: NDArray[np.complex128], others: NDArray[np.complex128]) -> tuple[complex, complex]:
+def _moved_onto(points: Complex, others: Complex) -> tuple[complex, complex]:
     """Turn (of length 1) and shift that bring points (n,) closest to others (n,), by the nearer half."""
     use, turn = np.ones(len(points), dtype=bool), 1.0 + 0.0j
     for _ in range(3):

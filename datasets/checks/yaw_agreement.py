@@ -44,6 +44,7 @@ SOURCES = {
     "accelerometer": YawSource("the specific force in turns", "imu", "accel-mirrored", "warning"),
 }
 """In the order in which they are suspected where the data leave it open."""
+CODES = {name: source.code for name, source in SOURCES.items()}
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
 """Limits of gyro rate over another source's. In rad/s it is the inverse track (0.3 to 4 1/m) or 1."""
 UNRELATED_R, LIVELY, MANY = 0.3, 0.05, 40
@@ -98,7 +99,7 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
         if len(blamed) > 1:
             fix += f" (assumed: no third source shows whether {source.label} or {other} is wrong)"
         yield Finding(
-            source.code, source.severity, source.channel,
+            CODES[name], source.severity, source.channel,
             f"{source.label} {_verb(name)} against {other}",
             _evidence(pairs, signs, found),
             fix,
