@@ -64,7 +64,7 @@ class TimedTable(Columns):
 def read_timed(
     path: Path, data: bytes, layout: TextLayout, numbers: Sequence[str], words: Sequence[str] = ()
 ) -> TimedTable:
-    """As `read_columns`, with the times (s) of the column `layout.time`; those in errors count as it says."""
+    """As `read_columns`, with the times of the column `layout.time`, in seconds."""
     text = read_columns(path, data, layout, numbers, [layout.time, *words])
     t_ns = text.times_ns(layout.time)
     return TimedTable(
@@ -100,7 +100,8 @@ def read_rows(
         layout = TextLayout(names, separator, 2 if header else 1, comment, columns[0])
         table = read_timed(path, data, layout, columns[1:])
         missing = np.argwhere(np.isnan(table.stack(columns[1:])))
-        if missing.size and table.text is not None:
+        if missing.size:
+            assert table.text is not None, "it was read from a text"
             row, k = missing[0].tolist()
             raise table.text.bad_cell(columns[k + 1], row, "give a finite number")
     return table

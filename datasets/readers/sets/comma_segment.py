@@ -78,15 +78,16 @@ def read(request: Request) -> list[Recording]:
     """
     folder = request.path if request.path.is_dir() else _segment_of(request.path)
     assert folder is not None, "claimed by its place"
-    signals = {name: _signal(folder / LOG / name, size) for name, (size, _) in SIGNALS.items()}
+    read = {name: _signal(folder / LOG / name, size) for name, (size, _) in SIGNALS.items()}
+    signals = {name: signal for name, signal in read.items() if signal is not None}
     poses = {name: _array(folder / POSE / name, size) for name, size in FRAMES.items()}
     frames = {name: values for name, values in poses.items() if values is not None}
-    clock_ns, notes = _unix_less_boot(signals["GNSS/live_gnss_ublox"], frames)
-    times = {n: row_times(request, n, s.t_ns + clock_ns) for n, s in signals.items() if s is not None}
-    found = {n: Signal(times[n].t_ns, s.value[times[n].order]) for n, s in signals.items() if s is not None}
+    clock_ns, notes = _unix_less_boot(signals.get("GNSS/live_gnss_ublox"), frames)
+    times = {name: row_times(request, name, signal.t_ns + clock_ns) for name, signal in signals.items()}
+    found = {name: Signal(t.t_ns, signals[name].value[t.order]) for name, t in times.items()}
     gnss, datum, about_fixes = _gnss(request, found.get("GNSS/live_gnss_ublox"))
     imu, about_imu = _imu({n: signal for n, signal in found.items() if SIGNALS[n][1] == "imu"})
-    truth, datum = _truth(request, frames, clock_ns, datum)
+    truth, datum = _truth(folder, frames, clock_ns, datum)
     wheels, steering = found.get("CAN/wheel_speed"), found.get("CAN/steering_angle")
     firsts = [int(one.t_ns[0]) for one in (imu, gnss, truth, wheels, steering) if one is not None]
     if not firsts:
@@ -208,19 +209,17 @@ def _imu(found: dict[str, Signal]) -> tuple[Imu | None, list[str]]:
 
 
 def _truth(
-    request: Request, frames: dict[str, Array], clock_ns: np.int64, datum: Datum | None
+    folder: Path, frames: dict[str, Array], clock_ns: np.int64, datum: Datum | None
 ) -> tuple[Trajectory | None, Datum | None]:
     """The camera's poses about `datum`, or about the first of them, which is then the datum."""
     if not {"frame_times", "frame_positions", "frame_orientations"} <= frames.keys():
         return None, datum
-    path = request.path / POSE / "frame_times" if request.path.is_dir() else request.path
     position, orientation = frames["frame_positions"], frames["frame_orientations"]
-    t_ns = _boot_ns(path, frames["frame_times"], len(position)) + clock_ns
+    t_ns = _boot_ns(folder / POSE / "frame_times", frames["frame_times"], len(position)) + clock_ns
     norms = np.linalg.norm(orientation, axis=1)
     if len(orientation) != len(position) or not (np.abs(norms - 1.0) < 0.01).all():
-        raise DataError(
-            "frame_orientations are no unit quaternions", file=path, remedy="copy the segment again"
-        )
+        path = folder / POSE / "frame_orientations"
+        raise DataError("are no unit quaternions", file=path, remedy="copy the segment again")
     enu, R_enu_ecef, datum = enu_from_ecef(position, datum)
     R_ecef_camera = quaternion_to_matrix(orientation[:, [1, 2, 3, 0]])
     quaternion = matrix_to_quaternion(R_enu_ecef @ R_ecef_camera @ FORWARD_LEFT_UP)
