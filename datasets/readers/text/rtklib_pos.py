@@ -73,8 +73,7 @@ def read(request: Request) -> list[Recording]:
     notes += [*columns.notes, *times.notes]
     if b"/geodetic" in data[:4096] and header.kind != BASELINE:
         notes.append("gnss: heights are above the geoid; taken as they are")
-    columns = columns.select(times.order)
-    fix = _fix(columns, notes)
+    fix, columns = _fix(columns, notes)[times.order], columns.select(times.order)
     fixes = _ecef(columns, fix, times) if header.kind == ECEF else _local(columns, fix, times, header.kind)
     base = _base(header, notes) if header.kind == BASELINE else None
     return [gnss_recording(request, fixes, base, "RTKLIB solution", notes, times)]
@@ -179,10 +178,8 @@ def _fix(columns: TextTable, notes: list[str]) -> NDArray[np.uint8]:
     q = columns.numbers["Q"]
     strange = np.flatnonzero(~np.isin(q, list(FIX_OF_Q)))
     if strange.size:
-        raise DataError(
-            f"Q is {q[strange[0]]:g} at data row {int(strange[0]) + 1}",
-            remedy="known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP",
-        )
+        known = "known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP"
+        raise columns.bad_cell("Q", int(strange[0]), known)
     if (q == 6).any():
         notes.append(f"gnss: {int((q == 6).sum())} PPP fixes are taken as 'float'")
     return np.array([*FIX_OF_Q.values()], dtype=np.uint8)[q.astype(np.int64)]

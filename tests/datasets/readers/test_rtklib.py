@@ -222,7 +222,7 @@ BAD = {
     "text in a number": (rows(np.array([DATUM])).replace("570.0000", "57O.0000"), "height.*57O.0000"),
     "a date that is none": (rows(np.array([DATUM])).replace("03/09", "13/09"), "2024/13/09"),
     "a year beyond any": (rows(np.array([DATUM])).replace("2024", "6024"), "6024/03/09"),
-    "an unknown Q": (rows(np.array([DATUM]), q="9"), "Q is 9"),
+    "an unknown Q": (rows(np.array([DATUM]), q="9"), "'Q' is '9' at line"),
     "a short line": (rows(np.array([DATUM])) + "2024/03/10 00:00:00.000 48.1\n" * 2, "line 5 has 3 cells"),
     "a long line": (rows(np.array([DATUM])).replace("4.5", "4.5 1 2"), "cells for"),
     "not on Earth": (rows(np.array([(95.0, 10.0, 0.0)])), "not on Earth"),
