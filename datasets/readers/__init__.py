@@ -15,7 +15,6 @@ and tables) with two functions, and list it in `formats.FORMATS`:
   caller adds the name of the file (`errors_of`, where there are several). A time that runs backwards is
   refused unless `request.repair_clock` (`timed_tables`). Bytes are of unknown origin: no count is believed
   before it was compared with what is there.
-- Optionally, for a folder, `member(path) -> Path | None`: a file in it that the catalogue may know it by.
 - Optionally `companions(path) -> Sequence[Path]`: the files that are read with this one.
 
 Helpers: `delimited` parses text tables, `text.fixes` places latitudes and longitudes, `channel_tables` makes

@@ -66,13 +66,6 @@ class Format:
             recordings: Sequence[Recording] = self._reader.read(request)
         return recordings
 
-    def member(self, path: Path) -> Path | None:
-        """A file that the catalogue may know the log by: itself, or one in its folder."""
-        if path.is_file():
-            return path
-        found: Path | None = self._reader.member(path) if hasattr(self._reader, "member") else None
-        return found
-
     def files(self, path: Path) -> list[Path]:
         """What `read` opens: all files of a folder; else the file and its companions."""
         if path.is_dir():

@@ -151,10 +151,10 @@ def _misspelt(name: str, place: Path) -> Path:
 
 
 def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, tuple[str, ...]]:
-    """What the catalogue says of a file, by its bytes, else by its format."""
+    """What the catalogue says of a log, by the bytes of a file, else by its format."""
     catalog = load_catalog()
-    file = form.member(path)
-    entry = catalog.find(file) if file is not None else None
+    files = [path] if path.is_file() else form.files(path)
+    entry = next((found for file in files if (found := catalog.find(file)) is not None), None)
     if entry is not None:
         known = catalog.sets[entry.set_name]
         return entry, known.conventions_of(entry.recording), known.notes_of(entry.recording)

@@ -65,11 +65,6 @@ def companions(path: Path) -> list[Path]:
     return [folder / name for name in names if (folder / name).is_file()]
 
 
-def member(folder: Path) -> Path | None:
-    """A file by which the catalogue knows the segment."""
-    return next((path for path in sorted((folder / LOG).rglob("value"))), None)
-
-
 def read(request: Request) -> list[Recording]:
     """The one recording of a segment.
 
