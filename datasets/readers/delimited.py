@@ -26,7 +26,6 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 
 BLOCK = 1 << 20
-NEWLINE = b"\n"
 BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
@@ -262,9 +261,8 @@ def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tup
     since_s = _since_s(data[:begin], layout, split(before.decode("utf-8", "replace"), layout.separator))
     until = "" if since_s is None else f", t = {since_s:.3f} s"
     end = data.count(b"\n", 0, begin)
-    return begin, (
-        f"{path.name}: the last line was cut off and is left out; its data end in line {end}{until}",
-    )
+    note = f"{path.name}: the last line was cut off and is left out; its data end in line {end}{until}"
+    return begin, (note,)
 
 
 def _since_s(data: bytes, layout: TextLayout, cells: Sequence[str]) -> float | None:
@@ -291,17 +289,16 @@ def _check_counts(data: bytes, layout: TextLayout) -> None:
 
 def _rows_of_other_width(data: bytes, layout: TextLayout, width: int) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of the rows that have not so many cells."""
-    mark = layout.separator.encode()
-    if layout.separator != BLANKS and b'"' in data:
+    mark = None if layout.separator == BLANKS else layout.separator.encode()
+    if mark is not None and b'"' in data:
         yield from ((line, cells) for line, cells in _rows(data, layout) if len(cells) != width)
         return
-    for number, line in enumerate(io.BytesIO(data), 1):  # no cell of these lines becomes an object
-        count = len(line.split()) if layout.separator == BLANKS else line.count(mark) + 1
+    for number, line in enumerate(io.BytesIO(data), 1):
+        count = len(line.split()) if mark is None else line.count(mark) + 1
         if count == width or number < layout.first_line or not line.strip():
             continue
-        text = line.decode("utf-8", "replace").rstrip("\n")
-        if not (layout.comment and text.startswith(layout.comment)):
-            yield number, text.split(None if layout.separator == BLANKS else layout.separator)
+        if not (layout.comment and line.startswith(layout.comment.encode())):
+            yield number, [cell.decode("utf-8", "replace") for cell in line.split(mark)]
 
 
 def _line_error(data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str) -> DataError:
