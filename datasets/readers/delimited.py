@@ -30,6 +30,8 @@ BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
 
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+
 MISSING = ("", "NaN", "nan", "NAN", "-nan")
 """Cells of a numeric column that stand for no value."""
 
@@ -97,7 +99,7 @@ class TextTable(Columns):
         try:
             return to_ns(self.texts[name].tolist(), unit)
         except NotADecimal as bad:
-            raise self.bad_cell(name, bad.row, f"give every row its time in {unit}") from None
+            raise self.bad_cell(name, bad.row, f"every row needs its time, in {UNIT_NAMES[unit]}") from None
 
     def line(self, row: int) -> tuple[int, list[str]]:
         """Number, from 1, and cells of the line of a data row (from 0)."""
