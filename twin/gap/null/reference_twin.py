@@ -62,7 +62,7 @@ SIGMA = 2.0  # 1 sigma of a number, in scales of `Coordinate` (assumed)
 EFFECT_SIGMA = 0.1
 """1 sigma of effects beside, in typical sizes (assumed): the numbers explain what they can."""
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
-FIRST_STEPS, STEPS, TRIES, ENOUGH = 3, 8, 4, 0.01
+FIRST_STEPS, STEPS, TRIES, ENOUGH = 3, 12, 4, 0.01
 """Most steps of each first search, of the one that begins again with the noise learnt there, tries of each,
 and the gain, as a share, below which one is the last."""
 MOST_STEPS = 4
