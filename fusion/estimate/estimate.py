@@ -26,6 +26,8 @@ STATUS = {
     "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }
 """Values of a status and the sentence that explains each."""
+JUMPED = "the fixes jumped as no robot moves, while wheels and gyro agree with them before and after"
+"""Why a fix was not used that follows such a jump."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Complex
 from terrafusion.datasets.core.planar_alignment import planar_rotation
-from terrafusion.fusion.estimate.estimate import State
+from terrafusion.datasets.core.printable import times
+from terrafusion.fusion.estimate.estimate import JUMPED, State
 from terrafusion.fusion.estimator.dead_reckoning import (
     LEAST_TURN_RAD,
     MARGIN,
@@ -26,6 +27,7 @@ from terrafusion.fusion.estimator.dead_reckoning import (
     DeadReckoning,
     FixPair,
 )
+from terrafusion.fusion.estimator.fix_jump import SAME_PLACE, FixJump
 from terrafusion.fusion.inputs.streams import WheelStream
 from terrafusion.fusion.inputs.validation import GnssFix
 
@@ -41,6 +43,9 @@ BRIEF_S, FORGOTTEN_S = 5.0, 10.0
 """Fixes that contradict for less than the one are forgotten after the other without any."""
 DOUBT, DOUBT_M = 0.35, 30.0
 """Sigma over the distance of both places, and the path after a jump over which it decays by e (assumed)."""
+JUMP_DOUBT, JUMP_DOUBT_M, HELD_S = 0.5, 100.0, 60.0
+"""The same for fixes that jumped, and how long they are held off: their path says nothing of which place is
+right; a receiver corrects a wrong ambiguity within a minute, mostly (assumed)."""
 SETTLED = 0.02
 """Share of the distance below which a jump is no longer in doubt."""
 REPEATED_SIGMA, REPEATED_M = 0.1, 0.005
@@ -66,10 +71,28 @@ BEYOND = "the place lies beyond what the robot can have driven"
 
 @dataclass
 class FixRun:
-    """Fixes, each within reach of the one before; `reachable`: the first was within reach of a used fix."""
+    """Fixes, each within reach of the one before; `reachable`: the first was within reach of a used fix.
+
+    `jump`: the jump from the used fixes to these, where they make one.
+    """
 
     reachable: bool
     pairs: list[FixPair]
+    jump: FixJump | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether its fixes jumped as no robot moves."""
+        return self.jump is not None and self.jump.impossible
+
+    def follows(self, pair: FixPair) -> bool:
+        """Whether a fix continues the jump of the run."""
+        return self.jump is not None and self.jump.continued(self.pairs[-1], pair, 1.0)
+
+    def append(self, pair: FixPair) -> None:
+        """Continue the run."""
+        self.pairs.append(pair)
+        del self.pairs[:-MOST_PAIRS]
 
     def seconds(self) -> float:
         """Time from its first to its last fix."""
@@ -117,7 +140,8 @@ class FixPlausibility:
         runs: fixes refused since then; run: the newest one's.
         mirrored: east and north are swapped, or one is reversed.
         jump_m: from the place left to the place believed, and the reach then; None where there is no doubt.
-        repeated, turned, beyond, jumps: fixes not used, by reason, and jumps beyond reach.
+        repeated, turned, beyond, jumped, jumps: fixes not used, by reason, and jumps beyond reach.
+        skids: jumps that may be a skid, too, and were followed.
     """
 
     anchors: list[FixPair] = field(default_factory=list)
@@ -129,6 +153,8 @@ class FixPlausibility:
     repeated: int = 0
     turned: int = 0
     beyond: int = 0
+    jumped: int = 0
+    skids: int = 0
     jumps: int = 0
     returns: int = 0
     _position: RepeatedPosition = field(default_factory=RepeatedPosition)
@@ -136,6 +162,10 @@ class FixPlausibility:
     _refused_ns: int | None = None
     _doubt_m: complex = 0j
     _since: list[FixPair] = field(default_factory=list)
+    _used: list[FixPair] = field(default_factory=list)
+    _believed: bool = False
+    _back: bool = False
+    _fades: tuple[float, float] = (DOUBT, DOUBT_M)
 
     def refusal(self, pair: FixPair, estimate: complex) -> str | None:
         """Why a fix must not be used whatever the gate says; None where it may be.
@@ -155,13 +185,39 @@ class FixPlausibility:
             del self._since[:-MOST_PAIRS]
             self.turned += 1
             return self._refused(pair, MIRRORED)
+        run = self.run
+        if run is not None and run.held and run.follows(pair):
+            return self._held(run, pair, estimate)
         return None
+
+    def _held(self, run: FixRun, pair: FixPair, estimate: complex) -> str | None:
+        """Hold a fix off that follows a jump, until these fixes are evidence."""
+        run.append(pair)
+        self._doubt_m = pair.fix - estimate
+        if run.seconds() >= HELD_S and run.is_evidence(1.0, run.jump.heading if run.jump else 1.0):
+            self._move(run, pair, JUMP_DOUBT, JUMP_DOUBT_M)
+            self._believed = True
+            return None
+        pair.usable = False
+        self.jumped += 1
+        return self._refused(pair, JUMPED)
+
+    def _move(self, run: FixRun, pair: FixPair, share: float, fades_m: float) -> None:
+        """Believe a place, with doubt."""
+        self.jumps += 1
+        self.jump_m, self.jump_at_m, self._fades = self._doubt_m, pair.reach_m, (share, fades_m)
+        for one in run.pairs:
+            one.usable = True
 
     def rejected(self, pair: FixPair, estimate: complex, track: DeadReckoning, scale: float) -> bool:
         """Take a fix that the gate rejects; True where its place is now believed although beyond reach."""
         if not self.anchors:
             self.anchors.append(dataclasses.replace(pair, fix=estimate))
+        if self._believed:
+            return True
         self.run = self._continued(pair, scale)
+        if self.run.reachable and self._jumped(self.run, track.heading, scale):
+            return True
         pair.usable = self.run.reachable
         pair.alone = not pair.usable and len(self.run.pairs) == 1
         if len(self.run.pairs) == 2:
@@ -173,22 +229,42 @@ class FixPlausibility:
             return False
         if self.run.reachable:
             return False
+        self._doubt_m = pair.fix - estimate
+        if self.run.held:
+            self.jumped += 1
+            self._refused(pair, JUMPED)
+            return False
         self.beyond += 1
         self._refused(pair, BEYOND)
-        self._doubt_m = pair.fix - estimate
         if not self.run.is_evidence(scale, track.heading):
             return False
-        self.jumps += 1
-        self.jump_m, self.jump_at_m = pair.fix - estimate, pair.reach_m
-        for one in self.run.pairs:
-            one.usable = True
+        self._move(self.run, pair, DOUBT, DOUBT_M)
         return True
+
+    def _jumped(self, run: FixRun, heading: complex, scale: float) -> bool:
+        """Test a run for a jump; True where it leads back to the place before the last one."""
+        run.jump = jump = FixJump.of(self._used, run.pairs, heading, scale)
+        if jump is None:
+            return False
+        if self.jump_m is not None and abs(jump.offset_m + self.jump_m) < SAME_PLACE * abs(self.jump_m):
+            run.jump, self._back = None, True
+            return True
+        if jump.impossible:
+            run.reachable = False
+            for one in run.pairs:
+                one.usable = False
+        return False
 
     def accepted(self, pair: FixPair, anew: bool) -> None:
         """A fix is used; `anew`: the estimate was moved there."""
-        known = self.run is not None and self.run.reachable
-        if anew and known and self.jump_m is not None and not within_reach(self.anchors[-1], pair, 1.0):
+        known, jump = self.run is not None and self.run.reachable, self.run.jump if self.run else None
+        far = anew and known and self.jump_m is not None and not within_reach(self.anchors[-1], pair, 1.0)
+        if far or self._back:
             self.jump_m, self.returns = None, self.returns + 1
+        elif jump is not None and not jump.impossible and self.run is not None and self.run.follows(pair):
+            self.skids += 1
+            self.jump_m, self.jump_at_m = jump.offset_m, pair.reach_m
+            self._fades = JUMP_DOUBT, JUMP_DOUBT_M
         if self.jump_m is not None and self._share(pair.reach_m) < SETTLED:
             self.jump_m = None
         self.anchors = [*self.anchors[-1 if anew else -2 : None if anew else -1], pair]
@@ -196,6 +272,9 @@ class FixPlausibility:
             self.anchors = [pair]
         self.runs.clear()
         self.run, self._in_a_row, self._refused_ns = None, 0, None
+        self._believed = self._back = False
+        if not self._used or pair.t_ns > self._used[-1].t_ns:
+            self._used = [*self._used[-1:], pair]
 
     def watch(self, t_ns: int) -> None:
         """Forget a brief contradiction once no fix has come for a time."""
@@ -219,8 +298,9 @@ class FixPlausibility:
 
     def notes(self) -> list[str]:
         """What was made of the fixes, in sentences."""
-        out = []
-        for count, why in ((self.repeated, REPEATS), (self.turned, MIRRORED), (self.beyond, BEYOND)):
+        out, counts = [], (self.repeated, self.turned, self.beyond, self.jumped)
+        reasons = zip(counts, (REPEATS, MIRRORED, BEYOND, JUMPED), strict=True)
+        for count, why in reasons:
             if count:
                 out.append(f"{count} GNSS fixes were not used: {why}")
         if self.jumps:
@@ -230,6 +310,11 @@ class FixPlausibility:
             )
         if self.returns:
             out.append(f"{self.returns} times the position went back to where it had been before such a move")
+        if self.skids:
+            out.append(
+                f"{times(self.skids)} fixes jumped to one side and stayed there: a skid between two fixes, "
+                "or a wrong fix; the position followed them, and its sigma spanned both places for a while"
+            )
         return out
 
     def _refused(self, pair: FixPair, why: str) -> str:
@@ -240,9 +325,8 @@ class FixPlausibility:
     def _continued(self, pair: FixPair, scale: float) -> FixRun:
         """The run that a rejected fix continues, or a new one."""
         for run in reversed(self.runs):
-            if within_reach(run.pairs[-1], pair, scale):
-                run.pairs.append(pair)
-                del run.pairs[:-MOST_PAIRS]
+            if run.follows(pair) if run.held else within_reach(run.pairs[-1], pair, scale):
+                run.append(pair)
                 self.runs.remove(run)
                 self.runs.append(run)
                 return run
@@ -254,12 +338,14 @@ class FixPlausibility:
 
     def _share(self, reach_m: float) -> float:
         """Sigma over the length of the jump."""
-        return DOUBT * math.exp(-(reach_m - self.jump_at_m) / DOUBT_M)
+        share, fades_m = self._fades
+        return share * math.exp(-(reach_m - self.jump_at_m) / fades_m)
 
     def _doubt(self, reach_m: float) -> tuple[complex, float]:
         """Distance between both places, and sigma over its length."""
         if self.run is not None and not self.run.reachable and len(self.run.pairs) >= CONTRADICTED:
-            return self._doubt_m, DOUBT if self._refused_ns is not None else 0.0
+            share = JUMP_DOUBT if self.run.held else DOUBT
+            return self._doubt_m, share if self._refused_ns is not None else 0.0
         if self.jump_m is not None:
             return self.jump_m, self._share(reach_m)
         return 0j, 0.0

@@ -15,7 +15,7 @@ from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import SMALL, is_firm
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.sensors import NO_SIGMA
-from terrafusion.fusion.estimate.estimate import STATUS
+from terrafusion.fusion.estimate.estimate import JUMPED, STATUS, Innovation
 from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
 from terrafusion.fusion.metrics.error_series import known_keyframes
 from terrafusion.fusion.metrics.health import examine_estimate
@@ -56,6 +56,9 @@ SIGNIFICANT_Z = 3.0
 IN_A_ROW = 5
 """Fixes beyond the gate one after the other from which on they are no outliers but contradict: the chance of
 it, at a gate of 99.9 %, is 1e-15 for independent errors."""
+JUMP_FIXES, SAME_OFFSET, JUMP_NS = 1, 0.25, 1_000_000_000
+"""Fixes rejected at one offset, within this share of it, before one is followed there; and the time after
+which the status tells of it."""
 FAR_BELOW = 0.3  # innovations over their sigma below which a sigma that no fix reports may be far too large
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
@@ -277,14 +280,45 @@ def _rejections(run: Run) -> Iterator[Reason]:
     begins, ends = runs(np.array(against))
     spans = zip(begins.tolist(), ends.tolist(), strict=True)
     first, end = max(spans, key=lambda span: span[1] - span[0], default=(0, 0))
-    if end - first >= IN_A_ROW:
-        size = float(np.median([np.hypot(*i.value[:2]) for i in fixes[first:end]]))
-        at = since_s(run, fixes[first].t_ns)
-        yield doubtful(
-            f"{end - first} fixes in a row from {at:.0f} s on lie {size:.1f} m off the estimate"
-            + (", which then moved to them" if fixes[end - 1].accepted else "")
-            + ": either they or the estimate are wrong there"
+    if end - first < IN_A_ROW:
+        yield from _followed(run, fixes)
+        return
+    part = fixes[first:end]
+    size = float(np.median([np.hypot(*i.value[:2]) for i in part]))
+    if part[-1].accepted:
+        then = ", which then moved to them"
+    else:
+        then = f", until {since_s(run, fixes[end].t_ns):.0f} s" if end < len(fixes) else ", to the end"
+    what = ": either they or the estimate are wrong there"
+    if any(i.reason == JUMPED for i in part):
+        what = ": they jumped there as no robot moves (a wrong ambiguity of RTK, say)" + (
+            "; either they are wrong after it, or those before it"
+            if part[-1].accepted
+            else " and were held off"
         )
+    yield doubtful(
+        f"{end - first} fixes in a row from {since_s(run, part[0].t_ns):.0f} s on lie {size:.1f} m off the "
+        f"estimate{then}{what}"
+    )
+
+
+def _followed(run: Run, fixes: list[Innovation]) -> Iterator[Reason]:
+    """Fixes that jumped to one side, stayed there, and were followed, with the status doubtful."""
+    t_ns, status = run.estimate.trajectory.t_ns, run.estimate.status.astype(str)
+    for k in range(JUMP_FIXES, len(fixes)):
+        *before, one = fixes[k - JUMP_FIXES : k + 1]
+        if not one.accepted or any(i.accepted for i in before):
+            continue
+        off = np.array([i.value[:2] for i in (*before, one)])
+        size = float(np.hypot(*off.mean(axis=0)))
+        after = (t_ns >= one.t_ns) & (t_ns <= one.t_ns + JUMP_NS)
+        if np.hypot(*(off - off[0]).T).max() > SAME_OFFSET * size or not (status[after] == "doubtful").any():
+            continue
+        yield doubtful(
+            f"the fixes jumped by {size:.1f} m at {since_s(run, before[0].t_ns):.0f} s, stayed there and "
+            "were followed: a skid between two fixes, or a wrong fix; the log does not show which"
+        )
+        return
 
 
 def _path_ratio(run: Run) -> Iterator[Reason]:

@@ -1,0 +1,64 @@
+"""Fixes that jump and stay: no skid of the wheels."""
+
+from __future__ import annotations
+
+import cmath
+
+import numpy as np
+import pytest
+
+from terrafusion.fusion.estimate.estimate import JUMPED
+from terrafusion.fusion.estimator.dead_reckoning import FixPair
+from terrafusion.fusion.estimator.fix_jump import FixJump
+from terrafusion.fusion.estimator.notes import notes_of
+from terrafusion.fusion.replay import replay
+from tests.fusion.estimator.test_plausibility import changed, run
+
+OFF_M = np.array([0.6, -0.5, 0.0])
+
+
+def offset(begin_s: float, end_s: float, every: int = 1):
+    def wrong(t: np.ndarray, enu: np.ndarray) -> np.ndarray:
+        return enu + ((t > begin_s) & (t < end_s))[:, None] * OFF_M
+
+    return wrong
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "fixed"])
+def test_fixes_that_jump_are_held_off_until_they_come_back(mode: str) -> None:
+    result = run(changed(offset(25.0, 45.0)), mode)
+    assert result.error_m.max() < 0.35
+    assert result.nees[result.t_s > 10.0].max() < 7.0
+    assert JUMPED in result.reasons()
+    assert result.states[-1].status == "running"
+    notes = notes_of(result.estimator)
+    assert any(JUMPED in note for note in notes)
+    assert not any("skidded" in note for note in notes)
+
+
+def test_a_jump_is_a_reason_to_doubt_the_run() -> None:
+    found = replay(changed(offset(25.0, 45.0)), mode="fixed").verdict
+    assert found is not None
+    assert found.value == "doubtful"
+    assert "they jumped there as no robot moves" in " ".join(found.reasons)
+
+
+def pairs(points: list[complex], step_s: float, driven_m: float, sigma_m: float = 0.014) -> list[FixPair]:
+    return [FixPair(round(i * step_s * 1e9), i * driven_m + 0j, p, sigma_m) for i, p in enumerate(points)]
+
+
+def test_only_a_constant_offset_that_needs_too_much_acceleration_is_a_jump() -> None:
+    turn = cmath.rect(1.0, 0.7)
+
+    def jump(offsets: list[complex], step_s: float, driven_m: float = 0.24) -> FixJump | None:
+        points = [turn * (i * driven_m + off) for i, off in enumerate(offsets)]
+        both = pairs(points, step_s, driven_m)
+        return FixJump.of(both[:2], both[2:], turn, 1.0)
+
+    wrong, slow = jump([0, 0, 0.8j, 0.8j], 0.2), jump([0, 0, 0.8j, 0.8j], 1.0)
+    assert wrong is not None
+    assert wrong.impossible
+    assert slow is not None
+    assert not slow.impossible
+    assert jump([0, 0, 0.4j, 0.8j], 0.2) is None
+    assert jump([0, 0, 0.05j, 0.05j], 0.2) is None
