@@ -94,6 +94,8 @@ def _findings(context: CheckContext) -> list[Finding]:
         units = [finding for check in UNIT_CHECKS for finding in check(context) if finding.code in UNIT_CODES]
         explained = {finding.channel for finding in units}
         findings = units + [finding for finding in findings if finding.channel not in explained]
+    if any(finding.code == "gyro-in-degrees" for finding in findings):  # its mean is in another unit, too
+        findings = [finding for finding in findings if finding.code != "gyro-bias"]
     return sorted(findings, key=lambda finding: finding.severity != "error")
 
 

@@ -47,6 +47,12 @@ SOURCES = {
 CODES = {name: source.code for name, source in SOURCES.items()}
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
 """Limits of gyro rate over another source's. In rad/s it is the inverse track (0.3 to 4 1/m) or 1."""
+DEGREE = np.pi / 180.0
+SAME_RATE, CLEARLY_R = (0.5, 2.0), 0.2
+"""Range of the gyro's rate over that of the path, and by how much better it must correlate as deg/s."""
+FASTEST_RADPS, LEAST_BEYOND, LEAST_SPAN_S = 12.0, 4, 10.0
+"""Two turns a second, which no ground robot makes (assumed); so many half-second means beyond it, in a log of
+so many seconds, at least."""
 UNRELATED_R, LIVELY, MANY = 0.3, 0.05, 40
 FINE_S, REACH_S, LATE_GAIN = 0.1, 5.0, 0.1
 """Step and reach of the search for a delay; how much better it must correlate than a changed sign."""
@@ -54,6 +60,21 @@ FINE_S, REACH_S, LATE_GAIN = 0.1, 5.0, 0.1
 
 def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
     """The gyro must be in rad/s."""
+    found = _far_larger(context) or _by_course(context) or _beyond_robots(context)
+    if found is None:
+        return
+    than, evidence = found
+    yield Finding(
+        "gyro-in-degrees", "error", "imu",
+        f"gyro z is far larger than {than}: it looks like deg/s",
+        evidence,
+        "multiply by pi / 180",
+        scaled("imu", DEGREE, "gyro_radps"),
+    )  # fmt: skip
+
+
+def _far_larger(context: CheckContext) -> tuple[str, str] | None:
+    """Another turn rate that the gyro exceeds by far, and the evidence."""
     found = _agreements(context)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
@@ -61,14 +82,43 @@ def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
             continue
         label = SOURCES[other].label
         unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {label}"
-        yield Finding(
-            "gyro-in-degrees", "error", "imu",
-            f"gyro z is far larger than the turn rate of {label}: it looks like deg/s",
-            f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
-            "multiply by pi / 180",
-            scaled("imu", np.pi / 180.0, "gyro_radps"),
-        )  # fmt: skip
-        return
+        return f"the turn rate of {label}", f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}"
+    return None
+
+
+def _by_course(context: CheckContext) -> tuple[str, str] | None:
+    """Whether gyro z as deg/s follows the course of the fixes, and as rad/s does not."""
+    gnss, yaw, start_ns = context.recording.gnss, gyro_angle(context.recording), context.recording.start_ns
+    if gnss is None or yaw is None:
+        return None
+    both = course_agreement(motion.Integral(yaw.t_s, DEGREE * yaw.value), gnss, start_ns)
+    if both is None or not both.is_significant():
+        return None
+    raw = course_agreement(yaw, gnss, start_ns)
+    if not SAME_RATE[0] < abs(both.slope) < SAME_RATE[1] or (raw and abs(raw.r) > abs(both.r) - CLEARLY_R):
+        return None
+    return (
+        "the turn rate of the path of the fixes",
+        f"as deg/s {abs(both.slope):.2f} times that of the path; correlation {both.r:.2f} in "
+        f"{both.windows} stretches",
+    )
+
+
+def _beyond_robots(context: CheckContext) -> tuple[str, str] | None:
+    """Whether gyro z turns, again and again, as no ground robot does."""
+    yaw = gyro_angle(context.recording)
+    if yaw is None or float(np.ptp(yaw.t_s)) < LEAST_SPAN_S:
+        return None
+    rates = np.abs(yaw.rates(np.arange(yaw.t_s[0], yaw.t_s[-1], motion.WINDOW_S)))
+    beyond = int((rates > FASTEST_RADPS).sum())
+    usual, top = np.percentile(rates, [50.0, 100.0]).tolist()
+    # A reading that is stuck is no turn: see signals.
+    if beyond < LEAST_BEYOND or usual > 0.5 * top or DEGREE * top > FASTEST_RADPS:
+        return None
+    return (
+        "a ground robot turns",
+        f"{top:.0f} rad/s at most and beyond {FASTEST_RADPS:g} in {beyond} half-second means",
+    )
 
 
 def check_turns(context: CheckContext) -> Iterator[Finding]:

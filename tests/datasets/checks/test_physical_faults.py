@@ -238,6 +238,13 @@ MENDED: dict[str, tuple[Fault, str, str]] = {
     "gyro in deg/s beside the truth": (
         untold(imu_with(gyro_radps=np.degrees), "wheels", "command", "gnss"), "gyro-in-degrees", "error",
     ),
+    "gyro in deg/s beside the fixes": (
+        untold(imu_with(gyro_radps=np.degrees), "wheels", "command", "truth"), "gyro-in-degrees", "error",
+    ),
+    "gyro in deg/s alone": (
+        untold(imu_with(gyro_radps=np.degrees), "wheels", "command", "truth", "gnss"),
+        "gyro-in-degrees", "error",
+    ),
     "gyro reversed": (imu_with(gyro_radps=times(1, 1, -1)), "yaw-sign", "error"),
     "gyro reversed, nothing but wheels and accelerometer": (
         untold(imu_with(gyro_radps=times(1, 1, -1)), "gnss", "truth", "command"), "yaw-sign", "error",
