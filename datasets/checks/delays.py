@@ -13,8 +13,13 @@ from terrafusion.datasets.checks.finding import (
     Finding,
     clocks_of,
     period_s,
-    retimed,
     retiming,
+)
+from terrafusion.datasets.checks.known_delays import (
+    interval_with_sigma,
+    lag_with_sigma,
+    on_one_clock,
+    sigma_s,
 )
 from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.checks.signals import without_stuck
@@ -259,10 +264,11 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     elif drifts := clock_drifts(context.recording, pairs):
         yield drift_finding(context.recording, drifts)
     else:
-        corrected = _on_one_clock(context)
+        corrected = on_one_clock(context)
         if corrected is not context:
             pairs = motion.signal_pairs(CheckContext(without_stuck(corrected), context.rig))
         lags, wheels_slip = sensor_lags(pairs)
+        lags = {pair: lag_with_sigma(lag, sigma_s(context, *pair)) for pair, lag in lags.items()}
         off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
         if off:
             precise = {p for p, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[p]}
@@ -270,18 +276,6 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
             yield offset_finding(corrected.recording, off, precise | set(off))
         elif not wheels_slip:
             yield from _late_fixes(corrected)
-
-
-def _on_one_clock(context: CheckContext) -> CheckContext:
-    """The context less the delays that the vehicle file has, as the estimator takes them out."""
-    recording = context.recording
-    for name, number in (("gnss", "gnss_delay_s"), ("wheels", "wheel_delay_s")):
-        late_ns, channel = round(context.known(number) * 1e9), getattr(recording, name)
-        if late_ns and channel is not None:
-            recording = retimed(recording, name, channel.t_ns - late_ns)
-    if recording is context.recording:
-        return context
-    return dataclasses.replace(context, recording=recording)
 
 
 def sensor_lags(pairs: motion.SensorPairs) -> tuple[dict[motion.Pair, Lag], bool]:
@@ -317,9 +311,9 @@ def _late_fixes(context: CheckContext) -> Iterator[Finding]:
     model = model_by_fixes(context)
     if model is None or abs(model.delay_s.value) < LEAST_LATE_S or model.rest > MOST_REST:
         return
-    if not model.delay_s.is_beyond(SIGNIFICANT_S):
+    late = interval_with_sigma(model.delay_s, sigma_s(context, "gnss"))
+    if not late.is_beyond(SIGNIFICANT_S):
         return
-    late = model.delay_s
     beyond = min(abs(late.low), abs(late.high)) > CALIBRATED_S
     yield Finding(
         "clock-offset", "error" if beyond else "warning", "gnss",
@@ -337,7 +331,17 @@ def offset_finding(recording: Recording, off: dict[motion.Pair, Lag], measured: 
     pair = min((p for p in off if name in p), key=lambda p: off[p].high_s - off[p].low_s)
     lag, against = off[pair], pair[0] if name == pair[1] else pair[1]
     if name == pair[0]:
-        lag = Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
+        lag = _reversed(lag)
+    why = motion.reason(name, set(off))
+    witnesses = {one for p in measured - set(off) if against in p for one in p} - {against}
+    if lag.seconds < 0.0 and witnesses == {"gnss"}:
+        name, against, lag = against, name, _reversed(lag)
+        why = (
+            f"a stamp is late rather than early (assumed): {name} agrees with gnss, so either both are "
+            f"late or {against} is early"
+        )
+    elif lag.seconds < 0.0 and not witnesses and len(off) == 1:
+        why += ", but it may be that which is late: no third clock shows it"
     ahead = name if lag.seconds < 0.0 else against
     limit_s = CALIBRATED_S if name == "gnss" else SLIDING_S if ahead == "wheels" else ERROR_FROM_S
     return Finding(
@@ -346,9 +350,14 @@ def offset_finding(recording: Recording, off: dict[motion.Pair, Lag], measured: 
         name,
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",
-        f"move the times of {name} by {-lag.seconds:+.3f} s; {motion.reason(name, set(off))}",
+        f"move the times of {name} by {-lag.seconds:+.3f} s; {why}",
         retiming(name, lambda t_ns: t_ns - round(lag.seconds * 1e9)),
     )
+
+
+def _reversed(lag: Lag) -> Lag:
+    """The lag of the first signal against the second."""
+    return Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
 
 
 def _matters(pair: motion.Pair, lag: Lag, one: motion.Signal, other: motion.Signal) -> bool:

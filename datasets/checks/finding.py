@@ -67,6 +67,11 @@ class CheckContext:
         number = getattr(self.rig.known, name) if self.rig else None
         return 0.0 if number is None else float(number.number)
 
+    def known_sigma(self, name: str) -> float:
+        """1 sigma of such a number; 0 without one."""
+        number = getattr(self.rig.known, name) if self.rig else None
+        return 0.0 if number is None else float(number.sigma or 0.0)
+
     def since_start_s(self, t_ns: np.int64 | int) -> float:
         """Seconds from the start of the recording."""
         return (int(t_ns) - self.recording.start_ns) * 1e-9  # Python integers: int64 could overflow

@@ -10,6 +10,7 @@ import pytest
 
 from terrafusion.datasets.checks import delays, path_model, scale
 from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.known_delays import lag_with_sigma, on_one_clock
 from terrafusion.datasets.checks.motion import Pair, Signal
 from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
@@ -97,6 +98,25 @@ def test_of_several_the_sharpest_lag_is_told(drive: Recording) -> None:
     assert "disagrees with imu and truth" in finding.fix
 
 
+def test_an_early_clock_that_fixes_alone_accuse_may_be_a_late_one(drive: Recording) -> None:
+    """Wheels and fixes that are both late agree with each other; truth would clear the wheels."""
+    off = {IMU: Lag(0.12, 0.11, 0.13, 0.9)}
+    finding = delays.offset_finding(drive, off, {IMU, GNSS})
+    assert finding.channel == "wheels"
+    assert finding.what == "its times are 0.120 s late against imu"
+    assert "wheels agrees with gnss, so either both are late or imu is early" in finding.fix
+    cleared = delays.offset_finding(drive, off, {IMU, GNSS, ("truth", "wheels")})
+    assert (cleared.channel, cleared.what) == ("imu", "its times are 0.120 s early against wheels")
+    alone = delays.offset_finding(drive, {IMU: Lag(-0.4, -0.5, -0.3, 0.9)}, {IMU})
+    assert "it may be that which is late" in alone.fix
+
+
+def test_a_delay_of_the_vehicle_file_brings_its_sigma() -> None:
+    lag = lag_with_sigma(Lag(0.318, 0.305, 0.332, 0.9), 0.186)
+    assert (lag.low_s, lag.high_s) == pytest.approx((0.318 - 0.3648, 0.318 + 0.3648), abs=1e-3)
+    assert lag_with_sigma(lag, 0.0) == lag
+
+
 @pytest.mark.parametrize(
     ("value", "low", "high", "words"),
     [
@@ -142,10 +162,10 @@ def test_delays_that_the_vehicle_file_has_are_taken_out_first(
     drive: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     context = CheckContext(drive, None)
-    assert delays._on_one_clock(context) is context
+    assert on_one_clock(context) is context
     known = {"gnss_delay_s": 0.2, "wheel_delay_s": -0.1}
     monkeypatch.setattr(CheckContext, "known", lambda self, name: known[name])
-    corrected = delays._on_one_clock(context).recording
+    corrected = on_one_clock(context).recording
     for name, late_ns in (("gnss", 200_000_000), ("wheels", -100_000_000), ("imu", 0)):
         np.testing.assert_array_equal(getattr(corrected, name).t_ns, getattr(drive, name).t_ns - late_ns)
 
@@ -209,4 +229,4 @@ def test_correlations_of_nothing_are_none() -> None:
 
 def test_a_context_without_known_delays_keeps_its_recording(drive: Recording) -> None:
     other = dataclasses.replace(drive, gnss=None)
-    assert delays._on_one_clock(CheckContext(other, None)).recording is other
+    assert on_one_clock(CheckContext(other, None)).recording is other
