@@ -39,7 +39,8 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool)
     header clocks do not agree. Messages without a header then take their receipt time, brought
     onto the header clock when the two clocks are more than a second apart.
 
-    Messages that arrived out of order are sorted. With `repair_clock` steps of the clock are taken out.
+    Messages that arrived out of order are sorted, also by receipt where that only varies by the time on the
+    way. With `repair_clock` steps of the clock are taken out.
 
     Raises:
         DataError: a clock that was set back, or header stamps that are zero in part.
@@ -47,12 +48,17 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool)
     timing = StreamTimes({kind: _in_file_order(stream) for kind, stream in streams.items()})
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
     received_jumps: tuple[ClockJump, ...] = ()
+    steady = {kind for kind, stream in timing.streams.items() if _only_delayed(stream)}
     if repair_clock:
-        receipt, received_jumps = repair_together(receipt)
+        stepping = {kind: t_ns for kind, t_ns in receipt.items() if kind not in steady}
+        repaired, received_jumps = repair_together(stepping)
+        receipt = receipt | repaired
     headed = _headed(timing, stamps)
     headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock)
     others = {kind: t for kind, t in receipt.items() if kind not in headed}
     for kind, t_ns in others.items():
+        if kind in steady:
+            continue
         _refuse_backwards(timing.streams[kind], t_ns, "receipt", REPAIR)
     timing.times = headed | _onto(headed, receipt, others)
     timing.jumps = (*header_jumps, *(jump for jump in received_jumps if jump.channel in others))
@@ -76,6 +82,18 @@ def _in_file_order(stream: Stream) -> Stream:
         return stream
     cuts, backwards = int((np.diff(order) != 1).sum()), int((np.diff(stream.receipt_ns) < 0).sum())
     return stream.select(order) if cuts <= 3 * backwards else stream
+
+
+def _only_delayed(stream: Stream) -> bool:
+    """Whether receipt stamps run back only because the time on the way varies: header stamps do not, and the
+    recorder's clock had no step beside them.
+    """
+    header = stream.header_ns
+    if header is None or not header.all() or in_order(header) is not None:
+        return False
+    if in_order(stream.receipt_ns) is None:
+        return False
+    return float(np.ptp(stream.receipt_ns - header)) < CLOCK_TOLERANCE_S * 1e9
 
 
 def _headed(timing: StreamTimes, stamps: str) -> Times:

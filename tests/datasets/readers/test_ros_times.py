@@ -133,6 +133,28 @@ def test_recorder_clock_set_back_matters_only_where_it_is_used(tmp_path: Path) -
     np.testing.assert_array_equal(times(recording)["command"], true_times(3 * MS)["command"])
 
 
+@pytest.mark.parametrize("stamps", ["header", "receipt"])
+def test_receipt_stamps_that_vary_by_the_time_on_the_way_are_no_steps(tmp_path: Path, stamps: str) -> None:
+    """A recorder of several threads stamps a fast topic 10 to 30 ms after its header: out of order."""
+    rng = np.random.default_rng(3)
+    rows: list[Message] = []
+    for topic, period in PERIODS.items():
+        if topic != "/cmd_vel":
+            true_ns = T0 + np.arange(SECONDS * S // period) * period
+            got = true_ns + rng.uniform(10 * MS, 30 * MS, len(true_ns)).astype(np.int64)
+            both = zip(true_ns.tolist(), got.tolist(), strict=True)
+            rows += [(topic, TYPES[topic], late, message(topic, stamp)) for stamp, late in both]
+    path = write_ros1(tmp_path / "a.bag", rows)
+    plain = open_recording(path)
+    recording = open_recording(path, stamps=stamps, repair_clock=True)
+    assert recording.clock_jumps == ()
+    for name, t_ns in times(recording).items():
+        late_ns = t_ns - times(plain)[name]
+        assert late_ns.min() >= 0
+        assert late_ns.max() <= 30 * MS if stamps == "receipt" else not late_ns.any()
+        assert (np.diff(t_ns) >= 0).all()
+
+
 def test_header_clock_that_leaps_ahead(tmp_path: Path) -> None:
     """Against the recorder's clock a leap is told from a gap; it is noted, and repaired where asked."""
     path = drive(tmp_path, header=[(12.2, 0.8)])
