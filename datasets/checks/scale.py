@@ -42,8 +42,7 @@ MOST_GYRO_MISSING = 0.01
 """With more empty cells, as where a range was exceeded, turns are missing: no scale."""
 MOST_GYRO = 0.2
 """Beyond this it is no scale, but another unit or axis."""
-
-
+NOT_INDEPENDENT = "scores against this truth are then not independent of it"
 UNITS = {
     "radps": {"rev/min": 2.0 * np.pi / 60.0, "deg/s": np.pi / 180.0, "rev/s": 2.0 * np.pi},
     "mps": {"km/h": 1.0 / 3.6, "cm/s": 0.01, "mm/s": 0.001},
@@ -62,7 +61,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         f"{scale.low:.3f} to {scale.high:.3f} (95 %) in {scale.windows} stretches by the {scale.source}"
     )
     if scale.source == "truth":
-        evidence += "; scores against this truth are then not independent of it"
+        evidence += f"; {NOT_INDEPENDENT}"
     known = 1.0 + context.known("wheel_scale")
     units = _fitting_units(context, scale, float(np.std(fits.scale) / np.median(fits.scale)))
     if units:
@@ -186,7 +185,7 @@ def check_gyro_scale(context: CheckContext) -> Iterator[Finding]:
         "gyro-scale", "warning", "imu",
         f"gyro z reads {abs(error.value):.1%} too {'much' if error.value > 0.0 else 'little'}",
         f"{1.0 + error.value:.4f} times the turns by {source}, 95 % interval {1.0 + error.low:.4f} to "
-        f"{1.0 + error.high:.4f}",
+        f"{1.0 + error.high:.4f}" + (f"; {NOT_INDEPENDENT}" if "truth" in source else ""),
         f"multiply gyro z by {factor:.4f}",
         changed_field("imu", "gyro_radps", lambda rates: rates * (1.0, 1.0, factor)),
     )  # fmt: skip

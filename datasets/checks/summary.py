@@ -94,6 +94,16 @@ def clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
     }
 
 
+def mean_rate_hz(t_ns: TimesNs) -> float | None:
+    """Rate over the span without its gaps: of stamps that vary by the time on the way the median interval is
+    too short.
+    """
+    dt = np.diff(t_ns) * 1e-9
+    period = float(np.median(dt)) if len(dt) else 0.0
+    held = dt[(dt <= GAP_PERIODS * period) | (dt <= GAP_S)]
+    return len(held) / float(held.sum()) if held.sum() > 0.0 else None
+
+
 def _ranges(channel: Channel) -> dict[str, Any]:
     """Smallest and largest number of a column, or the count of each word."""
     ranges: dict[str, Any] = {}

@@ -39,7 +39,7 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
     Raises:
         DataError: several of a kind, and nobody to ask.
     """
-    from terrafusion.datasets.checks.summary import clock
+    from terrafusion.datasets.checks.summary import clock, mean_rate_hz
     from terrafusion.datasets.core.errors import DataError
     from terrafusion.datasets.readers.ros.contents import bag_contents
 
@@ -47,7 +47,10 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
     if contents is None:
         return topics
     start_ns = min((int(t_ns[0]) for t_ns in contents.times_ns.values()), default=0)
-    clocks = {name: clock(start_ns, t_ns) for name, t_ns in contents.times_ns.items()}
+    clocks = {
+        name: clock(start_ns, t_ns) | {"rate_hz": mean_rate_hz(t_ns)}
+        for name, t_ns in contents.times_ns.items()
+    }
     print_lines(clock_table(clocks, "topic"))
     if contents.unused:
         print_lines(entry("not used", "dim", ", ".join(contents.unused)))
@@ -116,7 +119,7 @@ def _asked(name: str, question: str) -> Any:
 def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
     """What was measured, repaired and assumed, and the file."""
     from terrafusion.datasets.core.json_text import finite
-    from terrafusion.fusion.init.geometry import assumed_lines
+    from terrafusion.fusion.init.geometry import unmeasured_lines
 
     if "imu_axes" in found.draft:
         axes = found.draft["imu_axes"]
@@ -133,13 +136,14 @@ def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
         if not note.startswith("repaired: "):  # listed below
             yield from entry("note", "dim", note)
     for finding in found.repaired:
-        yield from entry("repaired", "yellow", f"{finding.channel}: {finding.what}; {finding.fix}")
+        text = f"{finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
+        yield from entry("repaired", "yellow", text)
     for finding in found.findings:
         yield from entry(
             finding.severity, "yellow", f"{finding.channel}: {finding.what} ({finding.evidence})"
         )
-    for text in assumed_lines(found.draft):
-        yield from entry("assumed", "yellow", text)
+    for word, text in unmeasured_lines(found.draft):
+        yield from entry(word, "yellow" if word == "assumed" else "", text)
     yield "", ""
     for line in out.read_text(encoding="utf-8").splitlines():
         yield "", line

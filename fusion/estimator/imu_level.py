@@ -83,9 +83,12 @@ class ImuLevel:
         """That samples are levelled, in a sentence."""
         if not any(self.corrects):
             return None
-        roll, pitch = (math.degrees(angle.rad) for angle in self.known)
+        parts = [
+            f"{name} {math.degrees(angle.rad):.1f} deg" if corrected or angle.rad else f"{name} not clear"
+            for name, angle, corrected in zip(("roll", "pitch"), self.known, self.corrects, strict=True)
+        ]
         return (
-            f"the IMU is tilted, roll {roll:.1f} and pitch {pitch:.1f} deg: its samples were levelled; "
+            f"the IMU is tilted, {' and '.join(parts)}: its samples were levelled; "
             "`terrafusion calibrate LOG --sensors` writes it to a vehicle file"
         )
 

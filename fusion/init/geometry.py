@@ -30,6 +30,8 @@ FLAGS = {
     "mass_kg": "--mass",
     "drive": "--drive",
 }
+STATED = "as the log states"
+"""How the line of a number of the log ends."""
 USUAL = {
     "wheel_radius_m": "odometry.wheel_radius_m",
     "track_m": "odometry.track_m",
@@ -58,7 +60,7 @@ def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> Draft
     if answers.drive is not None:
         return DraftLine(answers.drive, "given")
     if recording.overrides.drive is not None:
-        return DraftLine(recording.overrides.drive, "as the log states")
+        return DraftLine(recording.overrides.drive, STATED)
     if recording.steering is not None:
         rear = bool(recording.steering.axle_angles_rad()[:, 1].any())
         return DraftLine("four_wheel_steer" if rear else "ackermann", "the log has steering angles")
@@ -146,17 +148,18 @@ def _given(name: str, recording: Recording, answers: Answers, base: VehicleParam
         return DraftLine(answer, f"{unit}; given{other}")
     if stated is not None:
         value = tuple(round(v, 6) for v in stated) if isinstance(stated, tuple) else round(stated, 6)
-        return DraftLine(KnownNumber(value, "assumed"), f"{unit}; as the log states")
+        return DraftLine(KnownNumber(value, "assumed"), f"{unit}; {STATED}")
     spread = f" +- {NUMBERS[name].sigma:g}" if name in NUMBERS else ""
     words = f"{unit}; assumed{spread}, as of '{base.name}'; else give {FLAGS[name]}"
     return DraftLine(KnownNumber(usual, "assumed"), words + ("; only the twin uses it" * (name == "mass_kg")))
 
 
-def assumed_lines(draft: Draft) -> Iterator[str]:
-    """What the file assumes, in a sentence each."""
+def unmeasured_lines(draft: Draft) -> Iterator[tuple[str, str]]:
+    """What the file assumes or has from the log: which of them, and a sentence, each."""
     for name, line in draft.items():
         if line.assumed:
             value = line.value.value if isinstance(line.value, KnownNumber) else line.value
             shown = list(value) if isinstance(value, tuple) else value
             words = line.comment.replace("assumed, ", "").replace("assumed +-", "+-")
-            yield f"{name} = {shown} ({words})"
+            by_log = line.comment.endswith(STATED)
+            yield "from log" if by_log else "assumed", f"{name} = {shown} ({words})"

@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, units_of
 
@@ -61,7 +61,8 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"lat(?:itude)?", "gnss", ("latitude_deg",)),
     (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
     (r"alt|altitude|height|h", "gnss", ("height_m",)),
-    (r"(?:fix_)?quality|q", "gnss", ("fix",)),
+    (r"(?:fix_)?qual(?:ity)?|q", "gnss", ("fix",)),
+    (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
         (rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel)_?{a}", "imu", (f"gyro_{a}_radps",))
@@ -90,6 +91,10 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"yaw|heading", "truth", ("yaw_rad",)),
 )
 """Names of columns that people often use, the channel, and its fields that they may stand for."""
+_LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
+"""Names of a horizontal accuracy, which stands for the sigma of both axes."""
+_IN_G = (0.85, 1.15)
+"""Size of a specific force of a robot at rest that is in g."""
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
@@ -113,21 +118,58 @@ class _Header:
 
 
 def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
-    """A first column map, on one line, for the user to correct; the first row's cells tell a time's unit."""
+    """A first column map, on one line, for the user to correct; the first row's cells tell units."""
     headers = [_header(name) for name in names]
     time = next((h for h in headers if _TIME.search(h.base)), headers[0])
+    cells = dict(zip(names, first, strict=False))
     channels: dict[str, dict[str, str]] = {}
-    for header in headers:
-        guess = None if header is time else _guess(header)
-        if guess is not None and guess[1] not in channels.get(guess[0], {}):
-            channels.setdefault(guess[0], {})[guess[1]] = _entry(header, guess[1])
+    for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
+        if header.column == time.column:
+            continue
+        for channel, field in _guesses(header):
+            if field not in channels.get(channel, {}):
+                channels.setdefault(channel, {})[field] = _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
-    cell = dict(zip(names, first, strict=False)).get(time.column, "")
+    cell = cells.get(time.column, "")
     sections = ", ".join(
         f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
         for channel, fields in channels.items()
     )
     return f"time: {_time_entry(time, cell)}, channels: {{{sections}}}"
+
+
+def left_out(names: Sequence[str], proposal: str) -> list[str]:
+    """The columns that a proposed map does not use."""
+    return [name for name in names if json.dumps(name, ensure_ascii=False) not in proposal]
+
+
+def _guesses(header: _Header) -> list[tuple[str, str]]:
+    """Channels and fields that a column may stand for."""
+    if _LEVEL.fullmatch(header.base):
+        return [("gnss", "sigma_e_m"), ("gnss", "sigma_n_m")]
+    guess = _guess(header)
+    return [] if guess is None else [guess]
+
+
+def _in_g(headers: Sequence[_Header], cells: Mapping[str, str]) -> bool:
+    """Whether the first specific force is 1, not 9.8, long, in columns without a unit."""
+    square, axes = 0.0, 0
+    for header in headers:
+        guess = _guess(header)
+        if guess is None or not guess[1].startswith("accel_") or header.unit or header.column == guess[1]:
+            continue
+        try:
+            square += float(cells.get(header.column, "").replace(",", ".")) ** 2
+        except ValueError:
+            return False
+        axes += 1
+    return axes == 3 and _IN_G[0] ** 2 < square < _IN_G[1] ** 2
+
+
+def _of_g(header: _Header) -> _Header:
+    guess = _guess(header)
+    in_g = guess is not None and guess[1].startswith("accel_") and not header.unit
+    return replace(header, unit="g") if in_g else header
 
 
 def _header(name: str) -> _Header:

@@ -36,7 +36,7 @@ from terrafusion.datasets.readers.text.column_map import (
     units_of,
 )
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.proposed_map import TICKS, starter_map
+from terrafusion.datasets.readers.text.proposed_map import TICKS, left_out, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
 from terrafusion.datasets.readers.timed_tables import TimedTable, row_times
 
@@ -94,10 +94,12 @@ def _mapless(path: Path, names: list[str], first: list[str]) -> DataError:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
     proposal = starter_map(names, first)
     ticks = f" ({TICKS}: how many ticks make a turn?)" if TICKS in proposal else ""
+    unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
     return DataError(
         f"nothing says what the columns {', '.join(names)} are",
-        remedy=f"correct this proposal, whose fields and units are guesses{ticks} (entries: Plain tables in "
-        f"docs/reference/formats.md), and save it as {path.name}{MAP_SUFFIX}: {{{proposal}}}",
+        remedy=f"correct this proposal, whose fields and units are guesses{ticks}{unused} "
+        "(entries: Plain tables in docs/reference/formats.md), and save it as "
+        f"{path.name}{MAP_SUFFIX}: {{{proposal}}}",
     )
 
 

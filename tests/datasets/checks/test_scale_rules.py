@@ -288,7 +288,9 @@ def test_a_gyro_with_holes_has_no_scale(drive: Recording, monkeypatch: pytest.Mo
         gyro = drive.imu.gyro_radps.copy()
         gyro[: round(share * len(gyro)), 2] = np.nan
         holed = dataclasses.replace(drive, imu=dataclasses.replace(drive.imu, gyro_radps=gyro))
-        assert len(list(scale.check_gyro_scale(CheckContext(holed, None)))) == found
+        findings = list(scale.check_gyro_scale(CheckContext(holed, None)))
+        assert len(findings) == found
+        assert all(one.evidence.endswith(scale.NOT_INDEPENDENT) for one in findings)
     assert not list(scale.check_gyro_scale(CheckContext(dataclasses.replace(drive, imu=None), None)))
 
 

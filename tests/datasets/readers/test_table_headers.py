@@ -107,3 +107,17 @@ def test_columns_that_name_only_a_side_are_proposed_as_wheels(tmp_path: Path, na
     path.write_text(f"{names}\n0,1,1\n")
     with pytest.raises(DataError, match=r"wheels: \{left_mps: .*, right_mps: "):
         open_recording(path)
+
+
+def test_a_proposal_reads_accuracy_and_g_and_names_what_it_leaves_out(tmp_path: Path) -> None:
+    header = "t,AccX,AccY,AccZ,GyroZ,Lat,Lon,HAcc,FixQual,Battery"
+    path = table(tmp_path, f"{header}\n0,0.04,0.02,1.005,0.1,48,11,0.5,4,12.1\n", None)
+    with pytest.raises(DataError, match="which leaves out Battery ") as told:
+        open_recording(path)
+    (tmp_path / "drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    recording = open_recording(path)
+    assert recording.imu is not None
+    assert recording.imu.accel_mps2[0, 2] == pytest.approx(1.005 * 9.80665)
+    assert recording.gnss is not None
+    assert recording.gnss.sigma_enu_m[0, :2].tolist() == [0.5, 0.5]
+    assert recording.gnss.fix.tolist() == [Fix.FIXED]
