@@ -124,7 +124,7 @@ def first_vehicle(
         calibration, notes = _calibrated(mounted.recording, start, progress)
         findings = mounted.findings
         if calibration is not None:
-            draft |= forward | _learned_lines(calibration, draft)
+            draft |= forward | _learned_lines(calibration, draft, mounted.recording.imu is not None)
             learned = load_vehicle(write_draft(file, draft, "draft")).rig()
             findings = tuple(run_checks(mounted.recording, learned))
     if extended != "generic":
@@ -241,11 +241,14 @@ def _calibrated(
         return None, (f"the sensors are not calibrated: {error.what}",)
 
 
-def _learned_lines(calibration: SensorCalibration, draft: Draft) -> Draft:
-    """Lines of the numbers that the log determines; the user's own and those measured directly stay."""
+def _learned_lines(calibration: SensorCalibration, draft: Draft, has_imu: bool) -> Draft:
+    """Lines of the numbers that the log determines; the user's own and those measured directly stay.
+
+    Wheels that are the only sensor of motion are late against none.
+    """
     found: Draft = {}
     for name, number in vars(calibration.known()).items():
-        if number is None or number.known != "calibrated":
+        if number is None or number.known != "calibrated" or (name == "wheel_delay_s" and not has_imu):
             continue
         before = draft.get(name)
         if before is not None and isinstance(before.value, KnownNumber) and not before.assumed:
