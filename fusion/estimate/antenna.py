@@ -46,10 +46,9 @@ class AntennaPlaces:
         return stamp_ns - np.array(self.late_ns, dtype=np.int64)[self._rows(stamp_ns)]
 
     def later_shift(self, t_ns: TimesNs) -> tuple[Array, Array]:
-        """How far (N,) the levers, m, and delays, s, at the times (N,) are from the newest ones."""
-        off_m = np.linalg.norm(self.at(t_ns) - np.array(self.lever_m[-1]), axis=1)
+        """How far the levers (N, 3), m, and delays (N,), s, at the times (N,) are from the newest ones."""
         late_ns = np.array(self.late_ns, dtype=np.int64)
-        return off_m, np.abs(late_ns[self._rows(t_ns)] - late_ns[-1]) * 1e-9
+        return self.at(t_ns) - np.array(self.lever_m[-1]), (late_ns[self._rows(t_ns)] - late_ns[-1]) * 1e-9
 
     def _rows(self, t_ns: TimesNs) -> NDArray[np.int64]:
         found = np.searchsorted(np.array(self.since_ns), t_ns, side="right")

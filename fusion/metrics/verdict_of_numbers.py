@@ -20,7 +20,7 @@ and channel."""
 DELAY_SIGMAS = 2.0
 """A delay of the fixes is likely from so many of its sigmas on (95 %)."""
 LEAST_STEP_M = 1e-4
-"""Shorter steps between keyframes show no direction."""
+"""Shorter steps between keyframes, and shorter shifts, show no direction."""
 
 
 def misplaced_truth(run: Run) -> Iterator[Reason]:
@@ -62,20 +62,25 @@ def refuted(run: Run) -> Iterator[Reason]:
     """Results with numbers that the drive refuted later: their sigma does not include the difference.
 
     The angle of an IMU bends all that came before it was known; another antenna or delay shifts a result by
-    a known distance. With truth, the errors themselves are tested instead.
+    a known vector, and is tested against the variance along it. With truth, the errors themselves are tested
+    instead.
     """
-    t_ns, (speed_mps, variance_m2) = run.estimate.trajectory.t_ns[1:], _motion(run)
-    if run.scores.against == "truth" or not len(speed_mps):
+    path = run.estimate.trajectory
+    t_ns, P = path.t_ns[1:], path.covariance
+    if run.scores.against == "truth" or P is None or not len(t_ns):
         return
     wrong, names = np.zeros(len(t_ns), dtype=bool), []
     if run.corrections.imu_since_ns is not None:
         wrong |= t_ns < run.corrections.imu_since_ns
         names += ["the angle of the IMU"] if wrong.any() else []
     if run.corrections.antenna is not None:
-        shift_m, shift_s = run.corrections.antenna.later_shift(t_ns)
-        shifts_m = {"the antenna's place": shift_m, "the delay of the fixes": shift_s * speed_mps}
+        lever_m, shift_s = run.corrections.antenna.later_shift(t_ns)
+        shifts_m = {
+            "the antenna's place": _level(lever_m, path.yaw_rad()[1:]),
+            "the delay of the fixes": run.estimate.velocity_mps[1:, :2] * shift_s[:, None],
+        }
         for name, off_m in shifts_m.items():
-            beyond = off_m**2 > FIVE_SIGMA * variance_m2
+            beyond = (off_m**2).sum(axis=1) > FIVE_SIGMA * _variance_m2(P[1:, :2, :2], off_m)
             wrong |= beyond
             names += [name] if beyond.any() else []
     if wrong.mean() > STRAY_SHARE:
@@ -118,9 +123,23 @@ def _motion(run: Run) -> tuple[Array, Array]:
     if path.covariance is None or len(path) < 2:
         return np.zeros(0), np.zeros(0)
     east_m, north_m = np.diff(path.position_m[:, :2], axis=0).T
-    step_m, P = np.hypot(east_m, north_m), path.covariance[1:, :2, :2]
-    across = np.stack([-north_m, east_m], axis=1) / np.maximum(step_m, LEAST_STEP_M)[:, None]
-    variance_m2 = np.einsum("ni,nij,nj->n", across, P, across)
-    at_rest = step_m < LEAST_STEP_M
-    variance_m2[at_rest] = P[at_rest].trace(axis1=1, axis2=2) / 2.0
-    return step_m / (np.diff(path.t_ns) * 1e-9), variance_m2
+    variance_m2 = _variance_m2(path.covariance[1:, :2, :2], np.stack([-north_m, east_m], axis=1))
+    return np.hypot(east_m, north_m) / (np.diff(path.t_ns) * 1e-9), variance_m2
+
+
+def _variance_m2(P: Array, along_m: Array) -> Array:
+    """Variances (N,) by covariances P (N, 2, 2) along vectors (N, 2), the mean of both axes for those of no
+    direction.
+    """
+    length_m = np.hypot(*along_m.T)
+    unit = along_m / np.maximum(length_m, LEAST_STEP_M)[:, None]
+    variance_m2 = np.einsum("ni,nij,nj->n", unit, P, unit)
+    none = length_m < LEAST_STEP_M
+    variance_m2[none] = P[none].trace(axis1=1, axis2=2) / 2.0
+    return np.asarray(variance_m2)
+
+
+def _level(lever_m: Array, yaw_rad: Array) -> Array:
+    """Vectors (N, 3) of the body, which heads yaw (N,), east and north (N, 2)."""
+    turned = (lever_m[:, 0] + 1j * lever_m[:, 1]) * np.exp(1j * yaw_rad)
+    return np.stack([turned.real, turned.imag], axis=1)

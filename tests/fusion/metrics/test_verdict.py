@@ -293,6 +293,27 @@ def test_results_before_a_correction_beyond_their_sigma_are_not_good(drive, ante
     assert verdict(d, estimate=consistent(d), corrections=corrections).value == "good", "the truth tells"
 
 
+@pytest.mark.parametrize(
+    ("antenna", "axis", "value"),
+    [
+        ({"late_s": 0.5}, 0, "good"),
+        ({"late_s": 0.5}, 1, "doubtful"),
+        ({"lever_m": (0.3, 0.0, 0.0)}, 0, "good"),
+        ({"lever_m": (0.0, 0.3, 0.0)}, 0, "doubtful"),
+    ],
+)
+def test_a_correction_is_judged_by_the_sigma_along_its_shift(drive, antenna, axis, value):
+    """A robot that drives east; `axis`: along which its sigma, m, holds any shift."""
+    d = drive(noise_m=0.01, sigma_m=0.03)
+    path = d.estimate.trajectory
+    P = path.covariance.copy()
+    P[:, axis, axis] = 1.0
+    wide = dataclasses.replace(path, covariance=P)
+    estimate = dataclasses.replace(consistent(d), trajectory=wide)
+    found = verdict(d, truth=False, estimate=estimate, corrections=Corrections(antenna=places(d, **antenna)))
+    assert found.value == value, found
+
+
 @pytest.mark.parametrize(("after_s", "value"), [(15.0, "doubtful"), (0.5, "good")])
 def test_what_a_turned_imu_bent_before_its_angle_was_known_is_not_good(drive, after_s, value):
     d = drive()
