@@ -1,8 +1,9 @@
 """How far antenna and delay of the fixes may be from those in use.
 
-A number that corrects a sensor has its stated sigma. Of delays that correct nothing, most are as the robot's
-file says and some far from it: the probability of the second follows from the ratio of the densities, after
-and before the drive, of the first (Dickey 1971, Ann. Math. Statist. 42(1), 204).
+A number that corrects a sensor has its stated sigma, as an antenna has that is only assumed. Of delays that
+correct nothing, most are as the robot's file says and some far from it: the probability of the second follows
+from the ratio of the densities, after and before the drive, of the first (Dickey 1971, Ann. Math. Statist.
+42(1), 204).
 """
 
 from __future__ import annotations
@@ -53,16 +54,23 @@ class PlaceBelief:
     probability: Array
 
     @classmethod
-    def of(cls, known: Knowledge, before: Knowledge, corrected: NDArray[np.bool_]) -> PlaceBelief:
+    def of(
+        cls, known: Knowledge, before: Knowledge, corrected: NDArray[np.bool_], antenna_assumed: bool = False
+    ) -> PlaceBelief:
         """By what is `known` after the drive and `before` it.
 
         `corrected` (3,) are the numbers of which the drive shows that they are others. An antenna of which it
-        does not is where the file says.
+        does not is where the file says, unless that is only assumed: then all that is known of it is what the
+        drive leaves open.
         """
         mean, sigma, other = before.mean[PLACE], np.zeros(len(PLACE)), corrected.astype(float)
         free = [number for number, is_free in zip(PLACE, corrected.tolist(), strict=True) if is_free]
         mean[corrected], _ = known.given(free, unrefuted(known, before, free), before)
-        sigma[corrected] = known.stated_sigma(before, known.misfit)[free]
+        stated = known.stated_sigma(before, known.misfit)
+        sigma[corrected] = stated[free]
+        if antenna_assumed:
+            for row in np.flatnonzero(~corrected[:2]).tolist():
+                mean[row], sigma[row], other[row] = known.mean[PLACE[row]], stated[PLACE[row]], 1.0
         if GNSS_DELAY not in free:
             late_s, sigma[-1] = _delay_shown(known, before, free)
             mean[-1] += late_s

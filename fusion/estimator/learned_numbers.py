@@ -85,6 +85,7 @@ class LearnedNumbers:
         self._spec = config.rig.sensors.imu
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._known, self._skids = prior, config.rig.drive in SKIDDING
+        self._antenna_assumed = known.antenna_m is not None and known.antenna_m.known == "assumed"
         self._rule, self._before_skid = CorrectionRule(prior, self._skids), KnownBeforeSkid()
         self._place, self._moments = Kept[PlaceBelief](), Kept[Array]()
         if known != SensorNumbers():
@@ -217,7 +218,8 @@ class LearnedNumbers:
             return np.zeros((*used.shape[:-1], 4))
         rule = self._rule
         place = self._place.of(
-            (self._known,), lambda: PlaceBelief.of(self._known, rule.before, rule.clear_places)
+            (self._known,),
+            lambda: PlaceBelief.of(self._known, rule.before, rule.clear_places, self._antenna_assumed),
         )
         lag_s, lag_sigma_s = self._known.mean[COURSE_LAG], self._known.sigma[COURSE_LAG]
         lag_s2 = (lag_s - self.course_lag_s()[0]) ** 2 + lag_sigma_s**2

@@ -113,6 +113,9 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
             out, dataclasses.replace(robot.gnss_sigma_m, value=UP_FACTOR * robot.gnss_sigma_m.number), (UP,)
         )
     numbers = {name: raw[name] for name in SensorNumbers.__dataclass_fields__ if name in raw}
+    if _shipped(under):  # its antenna is not this robot's
+        place = _at(out, ANTENNA)["value"]
+        numbers = {"antenna_m": {"value": place, "known": "assumed"}, **numbers}
     if numbers or "robot" in out:
         out["robot"] = {**out.get("robot", {}), **numbers}
     return out

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from terrafusion.fusion.calibration.numbers import (
+    ANTENNA_SIGMA_M,
     ANTENNA_X,
+    ANTENNA_Y,
     GNSS_DELAY,
     GNSS_DELAY_SIGMA_S,
     IMITATED,
@@ -66,6 +68,20 @@ def test_a_corrected_number_has_its_stated_sigma_and_an_antenna_at_its_place_non
     corrected = PlaceBelief.of(exact, BEFORE, ALL).moments(np.zeros(3))
     assert np.sqrt(corrected) == pytest.approx(imitated, rel=1e-4)
     assert PlaceBelief.of(BEFORE, BEFORE, NONE).moments(np.zeros(3))[:2] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("row", "number"), [(0, ANTENNA_X), (1, ANTENNA_Y)])
+def test_an_assumed_antenna_that_the_drive_does_not_correct_may_be_where_the_drive_leaves_it(
+    row: int, number: int
+) -> None:
+    """Anywhere on the robot before it drives; then off by what was found, and by what is left open."""
+    used, known = np.zeros(3), shown(0.0, 0.02)
+    known.mean[number], known.covariance[number, number] = 0.1, 0.05**2
+    at_first = PlaceBelief.of(BEFORE, BEFORE, NONE, antenna_assumed=True).moments(used)
+    later = PlaceBelief.of(known, BEFORE, NONE, antenna_assumed=True).moments(used)
+    assert np.sqrt(at_first[row]) == pytest.approx(ANTENNA_SIGMA_M)
+    assert later[row] == pytest.approx(0.1**2 + 0.05**2 + IMITATED[number] ** 2)
+    assert later[2] == pytest.approx(PlaceBelief.of(known, BEFORE, NONE).moments(used)[2])
 
 
 def test_what_was_in_use_before_a_correction_is_off_by_the_correction() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -104,6 +105,27 @@ def test_fixes_on_time_stay_sharp(on_time: Recording) -> None:
     assert result.estimate.trajectory.covariance is not None
     assert np.sqrt(result.estimate.trajectory.covariance[-1, :2, :2].trace()) < 0.04
     assert 0.7 < 0.5 * squares(result).mean() < 1.4
+
+
+@pytest.mark.parametrize(("known", "inside"), [("assumed", True), ("measured", False)])
+def test_the_ellipses_hold_an_antenna_that_is_only_assumed(
+    on_time: Recording, known: str, inside: bool
+) -> None:
+    """Its place is 0.3 m off: the estimate is, too, until the drive shows it."""
+    vehicle = load_vehicle("elevate")
+    wrong = (vehicle.sensors.gnss.antenna_m[0] - 0.1, vehicle.sensors.gnss.antenna_m[1] - 0.3, 0.35)
+    gnss = dataclasses.replace(vehicle.sensors.gnss, antenna_m=wrong)
+    vehicle = dataclasses.replace(
+        vehicle,
+        sensors=dataclasses.replace(vehicle.sensors, gnss=gnss),
+        robot=dataclasses.replace(vehicle.robot, antenna_m=KnownNumber(wrong, known)),
+    )
+    result = replay(on_time, vehicle=vehicle)
+    errors = result.scores.errors
+    assert errors is not None
+    begin = errors.t_ns < on_time.start_ns + 10_000_000_000
+    share = float(np.mean(2.0 * errors.nees()[begin] < 5.991))
+    assert (share > 0.9) is inside
 
 
 def test_an_open_heading_turns_the_path_about_its_place() -> None:
