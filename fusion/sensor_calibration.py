@@ -122,8 +122,9 @@ class SensorCalibration:
         x, y = self.numbers["antenna_x_m"], self.numbers["antenna_y_m"]
         gained, nominal = round(max(x.gained_nats, y.gained_nats), 2), self.vehicle.sensors.gnss.antenna_m
         if not (x.observed or y.observed):
-            known = before is not None and before.known != "assumed"
-            return before if known else KnownNumber(nominal, "assumed", gained_nats=gained)
+            if before is not None and before.known != "assumed":
+                return before
+            return KnownNumber(nominal, "assumed", gained_nats=gained)
         place = (_digits(x.value, 6), _digits(y.value, 6), nominal[2])
         sigma = (_digits(x.sigma, 3), _digits(y.sigma, 3))
         return KnownNumber(place, "calibrated", sigma, self._logs(before), gained)
