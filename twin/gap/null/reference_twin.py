@@ -64,7 +64,7 @@ EFFECT_SIGMA = 0.1
 DIFFERENCE, LONGEST = 0.25, 1.5  # step of the differences, and the longest one of the search, in scales
 FIRST_STEPS, STEPS, TRIES, ENOUGH = 3, 12, 4, 0.01
 """Most steps of each first search, of the one that begins again with the noise learnt there, tries of each,
-and the gain, as a share, below which one is the last."""
+and the gain, as a share, from which one is taken: the file's numbers stay where others fit as well."""
 MOST_STEPS = 4
 """Integration steps a sample beyond which harder ground and stiffer motors than the given twin's are not
 tried: logs hardly tell them from softer ones, and all rollouts would take longer."""
@@ -167,8 +167,11 @@ class _Fit:
             w = np.zeros(len(self.numbers))
             (errors,) = self.errors([w])
             return self._search(_Found(w, errors, self.cost(w, errors)), STEPS).w
-        first = [self._search(start, FIRST_STEPS) for start in self._starts()]
-        return self._search(min(first, key=lambda found: found.cost), FIRST_STEPS).w
+        best, *others = (self._search(start, FIRST_STEPS) for start in self._starts())
+        for other in others:
+            if other.cost < (1.0 - ENOUGH) * best.cost:
+                best = other
+        return self._search(best, FIRST_STEPS).w
 
     def _search(self, at: _Found, steps: int) -> _Found:
         """At most so many steps from a start."""
@@ -186,8 +189,10 @@ class _Fit:
             w = at.w + np.clip(step, -LONGEST, LONGEST)
             (after,) = self.errors([w])
             cost = self.cost(w, after)
+            if cost < (1.0 - ENOUGH) * at.cost:
+                return _Found(w, after, cost, damping * LESS)
             if cost < at.cost:
-                return _Found(w, after, cost, damping * LESS, 1.0 - cost / at.cost < ENOUGH)
+                break
             damping *= MORE
         return dataclasses.replace(at, done=True)
 
