@@ -7,7 +7,6 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +21,6 @@ from terrafusion.datasets.core.sensors import DRIVES
 TRUTH_CHANNELS = ("position", "yaw", "orientation", "velocity")
 MAX_START_NS = 8 * 10**18
 """Leaves room for any t_s in int64."""
-CENTURY = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
-"""The years 2000 to 2099, in which a log is recorded."""
 _Metres = Annotated[tuple[float, float, float], Quantity("m", -20.0, 20.0, size=3)]
 
 
@@ -116,20 +113,7 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
     if strange:
         known = ", ".join(TRUTH_CHANNELS)
         remarks.append(f"meta.yaml: truth channels {', '.join(strange)} are not used; known are {known}")
-    remarks += _other_unit(file.start_ns)
     return Meta(**vars(file), remarks=tuple(remarks), metadata=finite(unknown))
-
-
-def _other_unit(start_ns: int) -> list[str]:
-    """A remark where the start is in 1970 as ns, and in this century as seconds, ms or us."""
-    for unit, size_ns in (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3)):
-        if CENTURY[0] <= start_ns * size_ns < CENTURY[1]:
-            meant = datetime.fromtimestamp(start_ns * size_ns // 10**9, UTC).date()
-            return [
-                f"warning: meta.yaml: start_ns {start_ns} is in 1970; if it is meant in {unit} ({meant}), "
-                f"write {start_ns * size_ns}"
-            ]
-    return []
 
 
 def _is_extra(key: str, given: Mapping[str, Any]) -> bool:

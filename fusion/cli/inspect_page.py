@@ -10,6 +10,9 @@ from typing import Any
 from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.common import Line, styled
 
+CENTURY_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
+"""Of the years 2000 to 2099."""
+
 WIDTH = 100
 INDENT = 10
 MOST_WORDS = 12
@@ -188,6 +191,10 @@ def _spread(values: dict[str, float], form: str) -> str:
 def _utc(start_ns: int) -> str:
     from datetime import UTC, datetime
 
-    if start_ns < 10**18:
-        return f"start {start_ns / 1e9:.3f} s (no calendar time)"
-    return f"start {datetime.fromtimestamp(start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    if start_ns >= CENTURY_NS[0]:
+        return f"start {datetime.fromtimestamp(start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    for unit, size_ns in (("s", 10**9), ("ms", 10**6), ("us", 10**3)):
+        if CENTURY_NS[0] <= start_ns * size_ns < CENTURY_NS[1]:
+            meant = datetime.fromtimestamp(start_ns * size_ns // 10**9, UTC).date()
+            return f"start {start_ns / 1e9:.3f} s after 1970; if start_ns is given in {unit}: {meant}"
+    return f"start {start_ns / 1e9:.3f} s (no calendar time)"

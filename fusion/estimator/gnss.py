@@ -44,8 +44,7 @@ WHITE_SHARE = 0.2
 dead-reckoned path."""
 SLOW_SIGMA = math.sqrt(1.0 - WHITE_SHARE)
 ALL_NEW = 0.75
-"""Estimated share from which all scatter is white: the estimate is off by a tenth or two (assumed). That
-shows neither a drift nor that there is none: only what RTK reports, to `RTK_SHEET_M`, is all there is."""
+"""Estimated share from which all is taken for white: the estimate is off by a tenth or two (assumed)."""
 OPTIMISTIC_SCATTER = 2.0
 """If the scatter of fixes exceeds this many times the reported sigma, sigma is inflated."""
 OPTIMISM = 3.0
@@ -418,10 +417,9 @@ class GnssUpdater:
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
         reported_m = fix.horizontal_sigma_m * inflation
-        by_report = (1.0 - self.white) / (1.0 - WHITE_SHARE)
-        slow = math.sqrt(max(by_report, 1.0 - (RTK_SHEET_M / fix.horizontal_sigma_m) ** 2))
+        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = min(self._class_scale.get(fix.fix, 1.0), OPTIMISM * reported_m / self.sheet_sigma_m)
-        self._least_drift_m = SLOW_SIGMA * reported_m * math.sqrt(by_report) / scale
+        self._least_drift_m = SLOW_SIGMA * reported_m / scale
         return slow * scale
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:

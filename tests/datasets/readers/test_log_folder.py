@@ -48,21 +48,6 @@ def test_times_are_exact_to_the_nanosecond(tmp_path: Path) -> None:
     assert np.isnan(back.accel_mps2).all()
 
 
-@pytest.mark.parametrize(("start", "unit"), [(1_700_000_000, "seconds"), (1_700_000_000_000, "milliseconds")])
-def test_a_start_in_another_unit_is_told(tmp_path: Path, start: int, unit: str) -> None:
-    meta = f"start_ns: {start}\n"
-    recording = open_recording(folder_with(tmp_path, meta=meta, wheels="t_s,speed_mps\n0,1\n"))
-    (note,) = [note for note in recording.notes if "start_ns" in note]
-    assert f"in {unit} (2023-11-14), write 1700000000000000000" in note
-
-
-@pytest.mark.parametrize("start", [0, 5, 1_700_000_000_000_000_000])
-def test_no_start_or_one_in_nanoseconds_is_no_remark(tmp_path: Path, start: int) -> None:
-    meta = f"start_ns: {start}\n"
-    recording = open_recording(folder_with(tmp_path, meta=meta, wheels="t_s,speed_mps\n0,1\n"))
-    assert not [note for note in recording.notes if "start_ns" in note]
-
-
 def test_missing_cells_are_nan_and_empty_rows_are_left_out(tmp_path: Path) -> None:
     folder = folder_with(tmp_path, wheels="t_s,left_mps,right_mps\n0,1,2\n0.1,,2.5\n0.2,,\n0.3,3,4\n")
     recording = open_recording(folder)

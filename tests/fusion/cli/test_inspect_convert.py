@@ -13,6 +13,7 @@ import pytest
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import formats, open_recording
+from terrafusion.fusion.cli.inspect_page import _utc
 from terrafusion.fusion.cli.main import app
 
 FILES = {
@@ -314,3 +315,16 @@ def test_a_folder_with_the_name_of_a_file_is_not_written(
     assert status == 1
     assert f"{name}: a folder is written, no {ending} file; give the name of a folder, or of a file" in err
     assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("start_ns", "words"),
+    [
+        (1_700_000_000_000_000_000, "start 2023-11-14 22:13:20 UTC"),
+        (1_700_000_000, "start 1.700 s after 1970; if start_ns is given in s: 2023-11-14"),
+        (1_700_000_000_000, "start 1700.000 s after 1970; if start_ns is given in ms: 2023-11-14"),
+        (5_000_000_000_000_000, "start 5000000.000 s (no calendar time)"),
+    ],
+)
+def test_a_start_in_another_unit_is_told(start_ns: int, words: str) -> None:
+    assert _utc(start_ns) == words
