@@ -48,7 +48,7 @@ NUMBERS = (
 LIMITS, DEAD_TIME = ("vehicle.drive.max_accel_mps2", "vehicle.drive.max_yaw_accel_radps2"), "dead_time_s"
 """Fitted, too, where commands drive the twin: within which limits the robot follows them, and how late."""
 LIMIT_SCALE, DEAD_TIME_SCALE_S = 0.5, 0.05  # of a limit's logarithm, and of the dead time (assumed)
-TOLD = 0.5  # share of a scale by which a number differs that is told
+NOTED = 0.5  # share of a scale from which a difference from the file is noted
 BASE = "vehicle.body.wheelbase_m"
 """Fitted for a robot of two driven wheels, whose casters do not scrub, where nobody measured it."""
 STARTS = {"shear_modulus_m": -3.0, "speed_loop_p_nms": 2.7, "speed_loop_i_nm": -6.0, "wheelbase_m": -4.0}
@@ -265,6 +265,6 @@ def differences(given: Model, shown: Model) -> list[str]:
     for name in (*LIMITS, f"vehicle.drive.{DEAD_TIME}", BASE):
         before, now = given.value(name), shown.value(name)
         apart = DEAD_TIME_SCALE_S if DEAD_TIME in name else LIMIT_SCALE * before
-        if abs(now - before) > TOLD * apart:
+        if abs(now - before) > NOTED * apart:
             parts.append(f"{name.removeprefix('vehicle.')} {now:.2g} (file: {before:.2g})")
     return [f"the twin is set to what the references show: {', '.join(parts)}"] if parts else []

@@ -15,7 +15,7 @@ from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.reference_twin import RUNS, _Fit, differences, set_to_references
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals, whitened
-from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.twin.gap.runs import DRIVE
 
@@ -84,18 +84,23 @@ def test_ground_that_is_too_hard_for_the_steps_is_not_tried() -> None:
     assert all(some is not None and len(some) == 1 for some in (found[0], found[2]))
 
 
+def set_to(robot: VehicleParams, file: VehicleParams) -> tuple[Model, Model]:
+    """The twin of a vehicle file, and as references of the robot set it."""
+    runs = [
+        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
+        for k in range(RUNS)
+    ]
+    logs, model, _ = prepared(runs, file, "loose_sand")
+    channels = tuple(o.channel for o in logs[0].observed)
+    return model, set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+
+
 def test_how_the_robot_follows_its_commands_is_that_of_the_references() -> None:
     """Limits of acceleration and a dead time that no owner has measured."""
     known = load_vehicle("elevate")
     own = {"max_accel_mps2": 0.7, "max_yaw_accel_radps2": 1.2, "dead_time_s": 0.06}
     robot = dataclasses.replace(known, drive=dataclasses.replace(known.drive, **own))
-    runs = [
-        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
-        for k in range(RUNS)
-    ]
-    logs, model, _ = prepared(runs, known, "loose_sand")
-    channels = tuple(o.channel for o in logs[0].observed)
-    found = set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+    model, found = set_to(robot, known)
     drive = found.vehicle.drive
     assert drive.max_accel_mps2 == pytest.approx(0.7, rel=0.1)
     assert drive.max_yaw_accel_radps2 == pytest.approx(1.2, rel=0.15)
@@ -112,11 +117,5 @@ def test_the_base_of_two_driven_wheels_is_found_where_nobody_measured_it() -> No
     drive = dataclasses.replace(known.drive, type="differential")
     file = dataclasses.replace(known, drive=drive, measured=())
     robot = dataclasses.replace(file, body=dataclasses.replace(file.body, wheelbase_m=0.1))
-    runs = [
-        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
-        for k in range(RUNS)
-    ]
-    logs, model, _ = prepared(runs, file, "loose_sand")
-    channels = tuple(o.channel for o in logs[0].observed)
-    found = set_to_references(logs, LinearisationCache(model, CANDIDATES), channels, 1)
+    _, found = set_to(robot, file)
     assert found.vehicle.body.wheelbase_m < 0.6 * known.body.wheelbase_m
