@@ -44,7 +44,8 @@ WHITE_SHARE = 0.2
 dead-reckoned path."""
 SLOW_SIGMA = math.sqrt(1.0 - WHITE_SHARE)
 ALL_NEW = 0.75
-"""Estimated share from which all is taken for white: the estimate is off by a tenth or two (assumed)."""
+"""Estimated share from which all scatter is white: the estimate is off by a tenth or two (assumed). An RTK
+receiver with fixed ambiguities then has no drift; scatter of any other does not show that it has none."""
 OPTIMISTIC_SCATTER = 2.0
 """If the scatter of fixes exceeds this many times the reported sigma, sigma is inflated."""
 OPTIMISM = 3.0
@@ -417,10 +418,11 @@ class GnssUpdater:
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
         reported_m = fix.horizontal_sigma_m * inflation
-        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
+        by_report = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = min(self._class_scale.get(fix.fix, 1.0), OPTIMISM * reported_m / self.sheet_sigma_m)
-        self._least_drift_m = SLOW_SIGMA * reported_m / scale
-        return slow * scale
+        self._least_drift_m = SLOW_SIGMA * reported_m * by_report / scale
+        fixed = fix.fix == Fix.FIXED or fix.horizontal_sigma_m <= RTK_SHEET_M
+        return (by_report if fixed else 1.0) * scale
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
         """1 sigma (3,) of the white part of a fix."""

@@ -101,13 +101,14 @@ class SkidDetector:
             dt * driving(node.point, node.wheels, dt) for dt, node in zip(steps_s, nodes, strict=True)
         ]
         fastest_mps = max(float(np.linalg.norm(node.point.velocity)) for node in nodes)
-        off_m = float(np.linalg.norm(refused[-1]))
-        if off_m > sum(rolled_m) + fastest_mps * float(sum(steps_s)) + REACH_SIGMA * sigma_m:
+        off_m, reach_m = float(np.linalg.norm(refused[-1])), sum(rolled_m) + fastest_mps * float(sum(steps_s))
+        if off_m > reach_m + REACH_SIGMA * sigma_m:
             return False
-        more_m2ps = max(0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps, 0.0)
+        skidded_m = min(off_m, reach_m)  # what is beyond reach is the fix's own error
+        more_m2ps = max(0.5 * skidded_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps, 0.0)
         if len(refused) > 1:
             doubt = np.zeros(chain.dim)
-            doubt[VELOCITY][:2] = (off_m / max(float(sum(steps_s)), LEAST_GAP_S)) ** 2
+            doubt[VELOCITY][:2] = (skidded_m / max(float(sum(steps_s)), LEAST_GAP_S)) ** 2
             chain.restart(doubt, begin)
         elif more_m2ps == 0.0:
             return False

@@ -128,6 +128,19 @@ def test_no_fix_beyond_what_wheels_and_speed_reach(sigma_m: float, reach_m: floa
         assert slide.refutations == found
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 0.02])
+def test_a_robot_that_hardly_moves_has_not_skidded_far(speed_mps: float) -> None:
+    """Fixes of a coarse receiver drift by half a metre while it stands."""
+    chain, slide = Recorder(rolled(speed_mps * DT_S)), SkidDetector()
+    for node in chain.nodes:
+        node.point = moving(speed_mps)
+    refuted(chain, slide, [(0.4, 0.0), (0.5, 0.0)], sigma_m=1.5)
+    after_20_s_m2 = 20.0 * slide.rate_m2ps * driving(moving(1.0), rolled(DT_S), DT_S)
+    assert after_20_s_m2 < 9.0
+    for _, _, wheels, _ in (call for call in chain.calls if call[0] == "revise"):
+        assert wheels.sigma[0] < 0.1
+
+
 def test_nothing_is_refuted_before_the_first_fix_or_without_wheels() -> None:
     assert not refuted(Recorder(), SkidDetector(), [(1.0, 0.0), (2.0, 0.0)], since_ns=None)
     chain = Recorder()
