@@ -82,6 +82,11 @@ class DriftWatch:
     def __post_init__(self) -> None:
         self.sheet_m = self.sigma_m
 
+    @property
+    def process(self) -> tuple[float, float]:
+        """1 sigma, m, each axis, and correlation time, s."""
+        return self.sigma_m, self.time_s
+
     def _move(self, before: DriftEstimate, now: DriftEstimate) -> tuple[tuple[float, float], float, float]:
         """A move east and north, m, the variance of it that a consistent filter has, and that of the drift
         itself, m2 an axis.

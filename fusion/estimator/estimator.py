@@ -300,7 +300,7 @@ class Estimator:
         self._set_step(max(self.config.keyframe_s, min(slowest_s, LONGEST_STEP_S)))
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         from_fixes = not self.gnss.local and self._search.known is None
-        spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
+        spec, drift_m = self.config.rig.sensors.imu, self.gnss.fix_noise.drift.sigma_m
         point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
         point, sigmas = self.learned.with_known(point, sigmas, start)
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
@@ -329,7 +329,7 @@ class Estimator:
         motion = self._motion.up_to(t_ns, self.chain, self.weights.noise)
         mean, planar = motion.mean, self.config.inputs.planar
         point, link, wheels = self._linked(t_ns, motion, before, switch)
-        up, drift = before.rotation[2], self.gnss.drift
+        up, drift = before.rotation[2], self.gnss.fix_noise.drift.process
         markov = slow_states.step(mean.dt_s, motion.noise, up, *drift, switch, wheels)
         for stream in (self.imu, self.wheels, self.steering):
             stream.late.used_ns = t_ns
@@ -346,8 +346,8 @@ class Estimator:
         """Share of the ground that changed before a keyframe at `t_ns`; the slip of the window follows it."""
         switch, dt_s = self.weights.take_switch(), (t_ns - self.chain.nodes[-1].t_ns) * 1e-9
         if switch > SWITCHED:
-            since_ns, noise = t_ns - SEEN_LATE_NS, self.weights.noise
-            slow_states.inflate_slip_covariance(self.chain, since_ns, dt_s, noise, *self.gnss.drift, switch)
+            noise, drift = self.weights.noise, self.gnss.fix_noise.drift.process
+            slow_states.inflate_slip_covariance(self.chain, t_ns - SEEN_LATE_NS, dt_s, noise, *drift, switch)
         return switch
 
     def _linked(

@@ -10,14 +10,14 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Fix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.alignment import KnownStart
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
-from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE, DriftWatch
+from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
+from terrafusion.fusion.estimator.fix_noise import OPTIMISTIC_SCATTER, FixNoise
 from terrafusion.fusion.estimator.fix_prediction import PredictedFix, without_height
 from terrafusion.fusion.estimator.fix_velocity import FixVelocities
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
@@ -32,25 +32,9 @@ from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import Weighting
 
-LEAST_SIGMA_M = 0.005
-KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
-"""Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
-sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 OUTAGE_S = 2.0
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
-WHITE_SHARE = 0.2
-"""Share of a fix's variance that is white; the rest drifts slowly. More where fixes scatter more about the
-dead-reckoned path."""
-SLOW_SIGMA = math.sqrt(1.0 - WHITE_SHARE)
-ALL_NEW = 0.75
-"""Estimated share from which all scatter is white: the estimate is off by a tenth or two (assumed). An RTK
-receiver with fixed ambiguities then has no drift; scatter of any other does not show that it has none."""
-OPTIMISTIC_SCATTER = 2.0
-"""If the scatter of fixes exceeds this many times the reported sigma, sigma is inflated."""
-OPTIMISM = 3.0
-"""A stand-alone receiver may report a sigma so many times below its data sheet and still drift; one that
-reports even less has fixes of a better class (RTK), which drift in proportion to their sigma."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """Heading sigma after the heading was corrected from the motion (assumed)."""
 VELOCITY_SIGMA_MPS = 0.3
@@ -69,8 +53,7 @@ class GnssUpdater:
         velocities: their velocities.
         rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
         turned: how often the heading was corrected from the motion.
-        scale: scatter of the fixes over their reported sigma, 1 where it is below `OPTIMISTIC_SCATTER`.
-        white: share of a fix's variance taken for white.
+        fix_noise: of the fixes, as they show it.
         last_used_ns: time of the newest fix in the graph.
     """
 
@@ -89,18 +72,10 @@ class GnssUpdater:
         # Quantiles of chi-square, without scipy.stats: its import takes half a second.
         self.gate = GnssGate(2.0 * float(gammaincinv(1.0, config.gnss_gate)))
         self.height_gate = GnssGate(2.0 * float(gammaincinv(0.5, config.gnss_gate)))
-        spec = config.rig.sensors.gnss
+        self.fix_noise = FixNoise(config.rig.sensors.gnss)
         self.track = DeadReckoning(self.antenna_m)
-        self.turned = 0
-        self.scale, self.white, self._applied_scale = 1.0, WHITE_SHARE, 1.0
-        self.sheet_sigma_m = spec.sigma_horizontal_m
-        self._class: Fix | None = None
-        self._class_scale: dict[Fix | None, float] = {}
+        self.turned, self._applied_scale = 0, 1.0
         self._bias_sigma = config.rig.sensors.imu.bias_sigma
-        self.drift_time_s = max(spec.correlation_time_s, 0.1)
-        # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
-        # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
-        self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
         self.local = False
         self.open_heading: OpenHeading | None = None
@@ -110,34 +85,18 @@ class GnssUpdater:
         self.rejected = 0
         self.too_late = 0
         self.last_used_ns: int | None = None
-        self._newest_ns = 0
         self._unchecked: GnssFix | None = None
         self._pair: FixPair | None = None
         self.velocities = FixVelocities()
         self.plausible = FixPlausibility()
         self._report = report
-        self._seen = 0
-        self.drift_watch = DriftWatch(SLOW_SIGMA * spec.sigma_horizontal_m, self.drift_time_s)
-        self._share, self._least_drift_m = 0.0, self.drift_sigma_m
-
-    @property
-    def drift_sigma_m(self) -> float:
-        """1 sigma of the slow errors, each axis."""
-        return self.drift_watch.sigma_m
-
-    @property
-    def drift(self) -> tuple[float, float]:
-        """1 sigma, m, and correlation time, s, of the slow errors."""
-        return self.drift_watch.sigma_m, self.drift_time_s
+        self._seen, self._share = 0, 0.0
 
     def queue(self, fix: GnssFix) -> None:
         """Take a fix in, in any order of time."""
         if self.delay_s:
             fix = dataclasses.replace(fix, t_ns=fix.t_ns - round(self.delay_s * 1e9))
-        least_m = self.sheet_sigma_m if self.sheet_sigma_m <= RTK_SHEET_M else KINEMATIC_M
-        if min(fix.sigma_m[:2].tolist()) < 0.999 * least_m:
-            sigma = np.append(np.maximum(fix.sigma_m[:2], least_m), fix.sigma_m[2])
-            fix = dataclasses.replace(fix, sigma_m=sigma)
+        fix = self.fix_noise.believable(fix)
         self.waiting.append(fix)
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
@@ -192,7 +151,7 @@ class GnssUpdater:
         A fix belongs to the first keyframe after it.
         """
         used = False
-        self.drift_watch.test_wheels(chain, self.skid, self.sheet_sigma_m, noise, self._least_drift_m)
+        self.fix_noise.test_wheels(chain, self.skid, noise)
         self.track.step(chain, self.skid.rate_m2ps > 0.0)
         self.plausible.watch(chain.nodes[-1].t_ns)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
@@ -211,18 +170,18 @@ class GnssUpdater:
             else:
                 if self._pair is not None:
                     self.track.keep(self._pair)
-                self._update_scale(self.track.scatter(), self.track.white_share())
-                if self.scale > OPTIMISTIC_SCATTER * self._applied_scale:
+                self.fix_noise.learn(self.track.scatter(), self.track.white_share())
+                if self.fix_noise.scale > OPTIMISTIC_SCATTER * self._applied_scale:
                     self._doubt_used(chain, fix)
                 if self.skid.friction is not None:
-                    self.skid.friction.score_fix(fix, self.scale)
+                    self.skid.friction.score_fix(fix, self.fix_noise.scale)
                 restarted = self._change_class(chain, k, fix)
                 if restarted or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                 used |= self._add_fix(chain, k, fix, noise)
                 if self._within_reach:
                     self._unchecked = fix
-        self.drift_watch.fresh = used and self._share >= LEAST_SHARE
+        self.fix_noise.drift.fresh = used and self._share >= LEAST_SHARE
         if used:
             self.weighting.revisit(chain)
         return used
@@ -257,18 +216,19 @@ class GnssUpdater:
             return GateDecision.ACCEPT, nis
         if verdict is GateDecision.ACCEPT or self._pair is None:
             return verdict, nis
-        if self.plausible.rejected(self._pair, self._antenna(chain, predicted.k), self.track, self.scale):
+        place, scale = self._antenna(chain, predicted.k), self.fix_noise.scale
+        if self.plausible.rejected(self._pair, place, self.track, scale):
             return GateDecision.REACQUIRE, nis
         return (verdict if self._within_reach else GateDecision.REJECT), nis
 
     def _align(self, chain: Chain, fix: GnssFix, noise: SensorNoise) -> bool:
         """Align a path that was begun without fixes with the map; True once they determine how."""
-        self.alignment = align_to_map(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
+        self.alignment = align_to_map(chain, self.track, fix, self.antenna_m, self.fix_noise.drift.sigma_m)
         if self.alignment is None:
             return False
         self.local, self.last_used_ns = False, fix.t_ns
         if chain.archive is not None:
-            self._add_local_fixes(chain.archive, noise.gnss_inflation * self.scale)
+            self._add_local_fixes(chain.archive, noise.gnss_inflation * self.fix_noise.scale)
         return True
 
     def _add_local_fixes(self, archive: Chain, inflation: float) -> None:
@@ -277,23 +237,16 @@ class GnssUpdater:
             k = keyframe_of(fix, archive)
             if k is None:
                 continue
-            at, share = AntennaMotion.of(archive, k, fix, self.antenna_m), self._drift_share(fix, inflation)
-            sigma = self._white_sigma(fix, inflation, share)
+            at = AntennaMotion.of(archive, k, fix, self.antenna_m)
+            sigma, share = self.fix_noise.of(fix, inflation)
             position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps)
             known = math.isfinite(fix.enu_m[2] + sigma[2])
             archive.add_fix(k, position if known else without_height(position, archive.state(k)))
 
-    def _update_scale(self, scatter: float, white: float) -> None:
-        """Scatter of the fixes about the path, and its white share, over the reported sigma."""
-        self.scale = scatter if scatter > OPTIMISTIC_SCATTER else 1.0
-        self.white = WHITE_SHARE if math.isnan(white) else max(white, WHITE_SHARE)
-        if self.white > ALL_NEW:
-            self.white = 1.0
-
     def _doubt_used(self, chain: Chain, fix: GnssFix) -> None:
         """Doubt what fixes of a far too small sigma have made of the window, once their scatter is known."""
-        first, ratio = self._applied_scale == 1.0, self.scale / self._applied_scale
-        self._applied_scale = self.scale
+        first, ratio = self._applied_scale == 1.0, self.fix_noise.scale / self._applied_scale
+        self._applied_scale = self.fix_noise.scale
         for k, node in enumerate(chain.nodes, chain.first):
             for old in node.fixes[:]:
                 wider = old.sigma_m * np.array([ratio, ratio, 1.0])
@@ -303,27 +256,20 @@ class GnssUpdater:
         chain.smooth(len(chain.nodes))
 
     def _doubt_window(self, chain: Chain, fix: GnssFix) -> None:
-        sigma_m = self.scale * fix.horizontal_sigma_m
+        sigma_m = self.fix_noise.scale * fix.horizontal_sigma_m
         doubt = np.zeros(chain.dim)
         doubt[2] = min(DOUBTFUL_YAW_SIGMA_RAD, sigma_m / max(self.track.extent_m(), 1e-3)) ** 2
         doubt[3:5], doubt[VELOCITY] = sigma_m**2, VELOCITY_SIGMA_MPS**2
-        doubt[BIAS], doubt[DRIFT] = self._bias_sigma**2, self.drift_sigma_m**2
+        doubt[BIAS], doubt[DRIFT] = self._bias_sigma**2, self.fix_noise.drift.sigma_m**2
         chain.restart(doubt, chain.first)
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
-        """Restart the drift where the class of fix changes; True when it does.
-
-        A receiver whose first fix of a class reports more than the data sheet drifts in proportion.
-        """
-        if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
-            return False
-        self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
-        self._class_scale[fix.fix] = max(1.0, fix.horizontal_sigma_m / self.sheet_sigma_m)
+        """Restart the drift where the class of fix changes; True when it does."""
         step = chain.nodes[k - chain.first].markov
-        if first or step is None:
+        if not self.fix_noise.changes_class(fix) or step is None:
             return False
         chain.revise(k, step.restarted(slice(1, 3)))
-        self.drift_watch.restart()
+        self.fix_noise.drift.restart()
         return True
 
     def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:
@@ -334,7 +280,7 @@ class GnssUpdater:
         if fix is None:
             return False
         yaw_sigma = float(np.sqrt(chain.covariance[2, 2]))
-        turn = self.track.heading_correction(yaw_sigma, self.scale)
+        turn = self.track.heading_correction(yaw_sigma, self.fix_noise.scale)
         if turn is None:
             return False
         k = chain.at_or_after(fix.t_ns)
@@ -343,8 +289,8 @@ class GnssUpdater:
         doubt = np.zeros(chain.dim)
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
-        doubt[SLIP], doubt[DRIFT] = noise.slip_sigma**2, self.drift_sigma_m**2
-        turn_window(chain, k, fix, turn, self.antenna_m, self.scale, doubt)
+        doubt[SLIP], doubt[DRIFT] = noise.slip_sigma**2, self.fix_noise.drift.sigma_m**2
+        turn_window(chain, k, fix, turn, self.antenna_m, self.fix_noise.scale, doubt)
         self.track.restart()
         self.skid.restart()
         self.turned += 1
@@ -360,7 +306,8 @@ class GnssUpdater:
             verdict, nis = self._gated(chain, predicted)
         used, weighted = verdict is not GateDecision.REJECT, predicted
         if verdict is not GateDecision.REACQUIRE:
-            test = predicted.innovation_test(self.scale, self.drift_sigma_m, self.white)
+            of = self.fix_noise
+            test = predicted.innovation_test(of.scale, of.drift.sigma_m, of.white)
             weighted = predicted.weighted(*self.weighting.gnss(test))
         why = "" if used or self._within_reach else BEYOND
         self._report(Innovation(fix.t_ns, "gnss", predicted.innovation_m, nis, 2, used, why))
@@ -377,10 +324,9 @@ class GnssUpdater:
         return True
 
     def _predicted(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> PredictedFix:
-        inflation = noise.gnss_inflation * self.scale
-        share = self._share = self._drift_share(fix, inflation)
-        white_m = self._white_sigma(fix, inflation, share)
-        return PredictedFix.of(chain, k, fix, self.antenna_m, white_m, share, fix.sigma_m * inflation)
+        inflation = noise.gnss_inflation * self.fix_noise.scale
+        white_m, self._share = self.fix_noise.of(fix, inflation)
+        return PredictedFix.of(chain, k, fix, self.antenna_m, white_m, self._share, fix.sigma_m * inflation)
 
     def _add_factors(self, chain: Chain, used: PredictedFix, verdict: GateDecision, inflation: float) -> None:
         """Position, with its height where its gate accepts it, and velocity of a fix."""
@@ -414,19 +360,3 @@ class GnssUpdater:
             return False
         self.gate.rejected.pop()  # it is tested again
         return True
-
-    def _drift_share(self, fix: GnssFix, inflation: float) -> float:
-        """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
-        reported_m = fix.horizontal_sigma_m * inflation
-        by_report = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
-        scale = min(self._class_scale.get(fix.fix, 1.0), OPTIMISM * reported_m / self.sheet_sigma_m)
-        self._least_drift_m = SLOW_SIGMA * reported_m * by_report / scale
-        fixed = fix.fix == Fix.FIXED or fix.horizontal_sigma_m <= RTK_SHEET_M
-        return (by_report if fixed else 1.0) * scale
-
-    def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
-        """1 sigma (3,) of the white part of a fix."""
-        *level, up = (fix.sigma_m * inflation).tolist()
-        drift_m2 = (share * self.drift_sigma_m) ** 2
-        white = [math.sqrt(max(sigma**2 - drift_m2, self.white * sigma**2)) for sigma in level]
-        return np.maximum([*white, up * self._height_factor], LEAST_SIGMA_M)

@@ -30,7 +30,8 @@ from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.before_skid import KnownBeforeSkid
 from terrafusion.fusion.estimator.correction_rule import CORRECTED, CorrectionRule, wheels_roll
-from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
+from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.estimator.turn_doubt import with_turn_doubt
@@ -114,7 +115,7 @@ class LearnedNumbers:
         """A fix as it came."""
         if self.calibration is not None:
             self.calibration.fix(fix.t_ns, fix.enu_m, fix.horizontal_sigma_m)
-        self.mounting.level.fix(fix, self._gnss.scale)
+        self.mounting.level.fix(fix, self._gnss.fix_noise.scale)
 
     def keyframe(
         self,

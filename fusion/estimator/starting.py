@@ -14,7 +14,8 @@ from terrafusion.fusion.estimator.alignment import (
     Start,
     level_start,
 )
-from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
+from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.heading_from_motion import MotionDoubt, MotionStart, heading_from_motion
 from terrafusion.fusion.estimator.learned_numbers import prior_of
 from terrafusion.fusion.estimator.plausibility import plausible_fixes
@@ -50,7 +51,7 @@ class StartSearch:
         self._newest_fix_came_ns = 0
         self._config, self._aids, self._gnss = config, aids, gnss
         self._antenna_m, self._ahead_m = np.array(config.rig.sensors.gnss.antenna_m), config.rig.ahead_m
-        self._doubt = MotionDoubt(prior_of(config).covariance, 1.0 - WHITE_SHARE, gnss.drift_time_s)
+        self._doubt = MotionDoubt(prior_of(config).covariance, 1.0 - WHITE_SHARE, gnss.fix_noise.drift.time_s)
 
     def find(self, imu: ImuStream, wheels: WheelStream, steering: SteeringStream, last: bool) -> Start | None:
         """The start, or None as long as there is none; `last`: no more samples will come."""

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.fusion.estimator.dead_reckoning import LEAST_DIFFERENCES, MOST_DIFFERENCES, DeadReckoning
-from terrafusion.fusion.estimator.gnss import ALL_NEW
+from terrafusion.fusion.estimator.fix_noise import ALL_NEW
 from terrafusion.fusion.inputs.validation import GnssFix
 
 STEP_NS, FIX_EVERY = 100_000_000, 5

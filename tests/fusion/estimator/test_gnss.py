@@ -19,8 +19,8 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
-from terrafusion.fusion.estimator.gnss import WHITE_SHARE
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import checked_fix
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -257,15 +257,16 @@ def test_a_receiver_that_lies_is_weighted_by_its_scatter(claimed_m: float, true_
     claims = np.where(t > 15.0, claimed_m, 0.02)[:, None]
     recording = with_fixes(honest, gnss.enu_m + lie, claims)
     fed = feed(recording, messages(recording))
-    taken_m = max(claimed_m, fed.estimator.gnss.sheet_sigma_m)  # no receiver is better than its data sheet
-    assert taken_m * fed.estimator.gnss.scale == pytest.approx(true_m, rel=0.5)
+    found = fed.estimator.gnss.fix_noise
+    taken_m = max(claimed_m, found.sheet_sigma_m)  # no receiver is better than its data sheet
+    assert taken_m * found.scale == pytest.approx(true_m, rel=0.5)
     late = nis_after(fed, honest.start_ns, 25.0)
     assert 0.3 < late.mean() / 2.0 < 2.0
     assert errors_m(honest, fed.states).max() < 2.0
 
 
 def test_an_honest_receiver_is_taken_at_its_word(drive: Recording) -> None:
-    assert feed(drive, messages(drive)).estimator.gnss.scale == 1.0
+    assert feed(drive, messages(drive)).estimator.gnss.fix_noise.scale == 1.0
 
 
 def test_noise_that_is_new_at_every_fix_is_told_from_a_drift(drive: Recording) -> None:
@@ -277,11 +278,11 @@ def test_noise_that_is_new_at_every_fix_is_told_from_a_drift(drive: Recording) -
     noise = np.random.default_rng(3).normal(0.0, 0.1, antenna.shape)
     white = with_fixes(drive, antenna + noise, np.full((len(antenna), 1), 0.1))
     fed = feed(white, messages(white))
-    assert fed.estimator.gnss.white > 0.5
+    assert fed.estimator.gnss.fix_noise.white > 0.5
     late = nis_after(fed, drive.start_ns, 15.0) * fed.estimator.weights.noise.gnss_inflation**2
     assert 0.6 < late.mean() / 2.0 < 1.5
     slow = with_fixes(drive, antenna + np.array([0.1, -0.07, 0.0]), np.full((len(antenna), 1), 0.1))
-    assert feed(slow, messages(slow)).estimator.gnss.white == WHITE_SHARE
+    assert feed(slow, messages(slow)).estimator.gnss.fix_noise.white == WHITE_SHARE
 
 
 def test_one_spike_of_707_m_moves_the_pose_by_less_than_10_cm(drive: Recording) -> None:
