@@ -13,6 +13,7 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import averaging
+from terrafusion.twin.model.vehicle import VehicleParams
 
 Indices = NDArray[np.int64]
 
@@ -49,6 +50,13 @@ def sample_map(log: PreparedLog) -> SampleMap:
         coarse = [_coarse(o, log) for o in log.observed]
         known = _CACHE[log] = SampleMap(blocks, _equally_spaced(log, blocks), fine, coarse)
     return known
+
+
+def driven_by(log: PreparedLog, vehicle: VehicleParams) -> PreparedLog:
+    """The log with the commands within the limits of a twin."""
+    out = log.driven_by(vehicle)
+    _CACHE[out] = sample_map(log)
+    return out
 
 
 def with_observed(log: PreparedLog, observed: Sequence[Observed]) -> PreparedLog:

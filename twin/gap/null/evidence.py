@@ -12,6 +12,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import digest, prepared
+from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
@@ -90,7 +91,7 @@ def gather_evidence(
     if references:
         given = model
         model = set_to_references(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
-        logs, notes = [log.driven_by(model.vehicle) for log in logs], [*notes, *differences(given, model)]
+        logs, notes = [driven_by(log, model.vehicle) for log in logs], [*notes, *differences(given, model)]
     candidates = candidates.beside(model.effects)
     linearised, done = LinearisationCache(model, candidates, known), itertools.count(1)
 

@@ -23,6 +23,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
 from terrafusion.twin.engine.stability import stable_steps
+from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
 from terrafusion.twin.gap.rollout.batch import INTEGRATOR_ORDER
@@ -121,7 +122,7 @@ class _Fit:
 
     def rollouts(self, model: Model) -> list[Rollout]:
         """The runs by a model, within its limits."""
-        return [Rollout(r.log.driven_by(model.vehicle), {}, model=model) for r in self.runs]
+        return [Rollout(driven_by(r.log, model.vehicle), {}, model=model) for r in self.runs]
 
     def steps(self, model: Model) -> int:
         """Integration steps a sample that a twin needs."""
@@ -235,7 +236,7 @@ def set_to_references(
         numbers = _numbers(cache, commanded=any(run.log.commanded for run in runs))
         fit = _Fit(cache, noise, numbers, [whitened(run.without_nuisance(), noise) for run in runs], jobs)
         model = fit.model(fit.solve(again))
-        logs, cache = [log.driven_by(model.vehicle) for log in logs], dataclasses.replace(cache, model=model)
+        logs, cache = [driven_by(log, model.vehicle) for log in logs], dataclasses.replace(cache, model=model)
     return model
 
 
