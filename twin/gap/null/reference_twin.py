@@ -235,7 +235,10 @@ def set_to_references(
         noise = learn_noise(runs, [], cache.candidates, jobs)
         numbers = _numbers(cache, commanded=any(run.log.commanded for run in runs))
         fit = _Fit(cache, noise, numbers, [whitened(run.without_nuisance(), noise) for run in runs], jobs)
-        model = fit.model(fit.solve(again))
+        w = fit.solve(again)
+        model = fit.model(w)
+        if not w.any():  # the noise would be learnt as before
+            break
         logs, cache = [driven_by(log, model.vehicle) for log in logs], dataclasses.replace(cache, model=model)
     return model
 
