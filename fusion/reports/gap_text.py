@@ -235,13 +235,15 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
     if s.floor is None:
         how = "by an unknown share: there are no references to compare with"
     elif s.share is None:
-        how = "by an unknown share: the gap is too little above what references have themselves"
+        how = "by an unknown share: the gap is hardly above what references have themselves; doubt the cause"
     else:
         interval = (
             "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
         )
         data = "on runs held out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
         how = f"by {100.0 * s.share:.0f} %{interval} with it in the twin, {data}"
+        if s.interval is not None and s.interval[0] <= 0.0:
+            how += ", perhaps not at all: doubt the cause"
     order = sorted(s.physical, key=lambda name: -abs(s.channels[name][0] - s.channels[name][1]))
     parts = []
     for name in order[:most]:

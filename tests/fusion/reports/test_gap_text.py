@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.fusion.reports.gap_text import explanation, numbers, verdict_line
+from terrafusion.fusion.reports.gap_text import _shrinks, explanation, numbers, verdict_line
 from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet, GapVerdict
 from terrafusion.twin.gap.data.candidates import Candidates
 
@@ -46,3 +46,15 @@ def test_sizes_that_grow_with_the_robot_say_for_which_they_are() -> None:
     assert [line.split(":")[0].strip() for line in grows] == [
         f"drivetrain_friction/{x}" for x in ("coulomb", "dry")
     ]
+
+
+@pytest.mark.parametrize(
+    ("share", "interval", "doubted"),
+    [(0.7, (0.4, 0.9), False), (0.0, (0.0, 0.3), True), (0.6, (0.0, 1.0), True), (None, None, True)],
+)
+def test_a_cause_that_removes_no_error_for_sure_is_doubted(
+    share: float | None, interval: tuple[float, float] | None, doubted: bool
+) -> None:
+    shrink = SimpleNamespace(floor=1.0, share=share, interval=interval, physical={}, channels={})
+    answer: Any = SimpleNamespace(shrinkage=shrink, verdict=SimpleNamespace(named=("mass",)), runs=("a", "b"))
+    assert ("doubt the cause" in _shrinks(answer, 3)[0]) == doubted

@@ -17,7 +17,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.infer.bank import SignatureBank
-from terrafusion.twin.gap.infer.predictive import Metric, Products
+from terrafusion.twin.gap.infer.predictive import Metric, Products, excess
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.rollout.nuisance import BASIS, CHANNEL_NAMES, command_basis
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
@@ -27,6 +27,7 @@ FUNCTIONS = ("speed", "abs_turn", "turn_rate", "acceleration")
 DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a quarter of the signature)
 ROUNDS, SAME = 4, 0.03
 """Most fits of laws, each with the discrepancy of the sizes before, and by what share these may differ."""
+LEFT = 0.5  # most that a second law may leave of the excess that the first leaves
 PAIRS, FIRST = 30, 5
 """Pairs that are fitted: the best to first sight, and all of the best laws."""
 
@@ -55,29 +56,42 @@ class CloseLook:
             before, share = share, np.array([np.linalg.norm(v) / max(self.size[i], 1e-9) for i, v in pairs])
             if np.allclose(share, before, atol=SAME):
                 break
-        whole = self._fit(laws, share)
-        return dataclasses.replace(found, gain=whole.gain, evidence=whole.evidence)
+        m, more = self._with_discrepancy(laws, share)
+        whole, left = self.laws.fit(m, laws), excess(m, found.used)
+        return dataclasses.replace(found, gain=whole.gain + more, evidence=whole.evidence + more, left=left)
 
-    def _fit(self, laws: Sequence[int], share: Array, first: int | None = None) -> Fitted:
-        """With discrepancies of shares (k,) of the given sizes: the first columns of each, or all."""
+    def _fit(self, laws: Sequence[int], share: Array, first: int) -> Fitted:
+        m, more = self._with_discrepancy(laws, share, first)
+        found = self.laws.fit(m, laws)
+        return dataclasses.replace(found, gain=found.gain + more, evidence=found.evidence + more)
+
+    def _with_discrepancy(
+        self, laws: Sequence[int], share: Array, first: int | None = None
+    ) -> tuple[Metric, float]:
+        """The metric with discrepancies of shares (k,) of the given sizes, the first columns of each, or all;
+        and what these add to the log likelihood of no effect."""
         D, K, e = np.concatenate([self.extra[i][:first] for i in laws]), self.metric.K, self.metric.error
         sigma = DISCREPANCY * np.repeat(share, [len(self.extra[i][:first]) for i in laws])
         L = np.linalg.cholesky(sigma[:, None] * K[np.ix_(D, D)] * sigma + np.eye(len(D)))
         half = np.linalg.solve(L, sigma[:, None] * K[D])
         less = half.T @ half
-        found = self.laws.fit(Metric(K - less, self.metric.shared), laws)
-        # What the discrepancy adds to the log likelihood of no effect.
         more = 0.5 * float(less[e, e]) - float(np.log(np.diag(L)).sum())
-        return dataclasses.replace(found, gain=found.gain + more, evidence=found.evidence + more)
+        return Metric(K - less, self.metric.shared), more
 
     def search(self) -> dict[tuple[int, ...], Fitted]:
-        """Fits of all laws alone and of all pairs that look promising."""
+        """Fits of all laws alone and of the pairs that look promising.
+
+        A second law counts only where it explains most of what the first leaves: a law that is not quite the
+        robot's leaves something of the shape of no law, a part of which any other explains.
+        """
         found: dict[tuple[int, ...], Fitted] = {(i,): self.fit((i,)) for i in self.index}
         best = sorted(self.index, key=lambda i: -found[i,].evidence)[:FIRST]
         guess = self._pairs()
         pairs = {*sorted(guess, key=lambda pair: -guess[pair])[:PAIRS]}
         pairs |= {(min(pair), max(pair)) for pair in itertools.combinations(best, 2)} & guess.keys()
-        return found | {pair: self.fit(pair) for pair in sorted(pairs)}
+        both = {pair: self.fit(pair) for pair in sorted(pairs)}
+        least = {(a, b): min(found[a,].left, found[b,].left) for a, b in both}
+        return found | {pair: fit for pair, fit in both.items() if fit.left <= LEFT * least[pair]}
 
     def _pairs(self) -> dict[tuple[int, int], float]:
         """Log likelihood ratio of every pair of effects to first sight: one at its best alone, the other

@@ -22,7 +22,7 @@ from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, metric
+from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, excess, metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns
@@ -51,6 +51,7 @@ class Explanation:
         outside: log evidence of a cause outside the catalogue.
         alike: by effect, those whose whole signatures nearly coincide with its own at their sizes.
         left_out: gives the values of a set's best laws fitted without each run, one tuple a run.
+        left: share (0..1) of the gap's excess (`predictive.excess`) that a set leaves, after a close look.
     """
 
     evidence: dict[Sets, float]
@@ -58,6 +59,7 @@ class Explanation:
     outside: float
     alike: dict[str, set[str]]
     left_out: Callable[[Fitted], list[tuple[Array, ...]]]
+    left: Mapping[Sets, float] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +228,10 @@ def _close_look(
         return [laws.fit(part, some).values for part in parts]
 
     alike = _same_signatures(plain, [found[i,] for i in index])
-    return _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
+    every = _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
+    whole = max(excess(look.metric), 1e-9)
+    left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()}
+    return dataclasses.replace(every, left=left)
 
 
 def _same_signatures(runs: Sequence[Products], fits: Sequence[Fitted]) -> dict[str, set[str]]:

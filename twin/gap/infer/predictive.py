@@ -19,6 +19,8 @@ from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.score import without_states
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
+NORMAL = 2.0  # standard deviations within which a square is no larger than expected (assumed)
+
 
 @dataclass(frozen=True, eq=False)
 class Products:
@@ -74,6 +76,23 @@ def metric(runs: Sequence[Products], sigma: Array, robot: RobotOffsets) -> Metri
         total += marginalise_run_offsets(rest, robot)
     total = marginalise_robot_offsets(total, robot)
     return Metric(np.pad(0.5 * (total + total.T), (0, 1)), P)
+
+
+def excess(m: Metric, used: Array | None = None) -> float:
+    """By how much an error is larger, along the columns of effects and nuisance, than references predict.
+
+    Without a change its score k there is N(0, K), and k'(K + 1)^-1 k the square of the change, of typical
+    sizes, that fits it; this less its mean and `NORMAL` standard deviations, at least zero.
+
+    Args:
+        used: (M + 1,) coefficients of the signatures to subtract from the error.
+    """
+    P, own = m.shared, np.eye(len(m.K))[m.error]
+    k = m.K[:P] @ (own if used is None else own - used)
+    fitted = np.linalg.solve(m.K[:P, :P] + np.eye(P), np.column_stack([k, m.K[:P, :P]]))
+    share = fitted[:, 1:]
+    usual = float(np.trace(share)) + NORMAL * float(np.sqrt(2.0 * (share * share.T).sum()))
+    return max(float(k @ fitted[:, 0]) - usual, 0.0)
 
 
 def marginalise_run_offsets(products: Array, robot: RobotOffsets) -> Array:

@@ -37,6 +37,7 @@ class Fitted:
         gain: log likelihood ratio.
         evidence: log evidence.
         covariance: (k, k) of each one's values.
+        left: excess of what they leave (`predictive.excess`); zero without a close look.
     """
 
     laws: tuple[Hypothesis, ...]
@@ -45,6 +46,7 @@ class Fitted:
     gain: float
     evidence: float
     covariance: tuple[Array, ...]
+    left: float = 0.0
 
     @property
     def columns(self) -> tuple[int, ...]:

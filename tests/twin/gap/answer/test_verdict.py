@@ -28,10 +28,11 @@ def fitted(*effects: str) -> Fitted:
 def verdict(
     evidence: dict[tuple[str, ...], float], outside: float = -50.0,
     detection: Detection = FOUND, alike: dict[str, set[str]] | None = None, other_drives: bool = False,
+    left: dict[tuple[str, ...], float] | None = None,
 ) -> GapVerdict:  # fmt: skip
     every = {(name,): -50.0 for name in NAMES} | evidence
     fits = {effects: fitted(*effects) for effects in every}
-    found = Explanation(every, fits, outside, alike or {}, lambda fit: [fit.values] * 3)
+    found = Explanation(every, fits, outside, alike or {}, lambda fit: [fit.values] * 3, left or {})
     return judge(detection, 0.05, found, CANDIDATES, HEAD, other_drives)
 
 
@@ -85,6 +86,17 @@ def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     assert none.kind == "no_gap"
     assert none.p_unknown == 0.0
     assert none.sets == []
+
+
+def test_a_set_is_as_certain_as_the_share_of_the_gap_that_it_explains() -> None:
+    most = verdict({("mass",): 600.0}, left={("mass",): 0.3})
+    assert most.named == ("mass",)
+    assert most.sets[0].probability == pytest.approx(0.7, abs=0.02)
+    assert most.p_unknown == pytest.approx(0.3, abs=0.02)
+    little = verdict({("mass",): 600.0, ("gyro_bias", "mass"): 500.0}, left={("mass",): 0.7})
+    assert little.kind == "unknown"
+    assert little.named == ()
+    assert little.p_unknown == pytest.approx(0.7, abs=0.02)
 
 
 def test_an_extrapolated_p_value_is_little_evidence_of_an_unknown_cause_on_other_drives() -> None:

@@ -10,7 +10,7 @@ from terrafusion.twin.gap.infer.predictive import Metric
 from terrafusion.twin.gap.infer.single_effects import Laws
 from tests.twin.gap.infer.test_single_effects import CANDIDATES, law, noise, problem
 
-SCALE = law("gyro_scale", "scale")
+SCALE, BIAS = law("gyro_scale", "scale"), law("gyro_bias", "constant")
 GIVEN = 20.0  # size at which the discrepancy is given
 
 
@@ -58,6 +58,28 @@ def test_a_size_is_that_of_the_channel_that_shows_most() -> None:
     by_channel = GIVEN * (signature * strength)[:, None] * np.column_stack([half, 1.0 - half])
     fit = close_look(columns, by_channel, error).fit((SCALE,))
     assert fit.values[0][0] == pytest.approx(10.4, abs=0.3)
+
+
+@pytest.mark.parametrize(("odd", "both"), [(0.0, True), (1.0, False)])
+def test_a_second_law_explains_most_of_what_the_first_leaves(odd: float, both: bool) -> None:
+    """Or what the first leaves has the shape of no law: here of ten columns beside a little of the second."""
+    columns, signature, half = setting()
+    others = np.random.default_rng(8).standard_normal((len(half), 10))
+    bias = columns[:, CANDIDATES.hypotheses[BIAS].columns[0]]
+    error = GIVEN * signature + bias + odd * others.sum(axis=1) + noise(8)
+    nothing = np.zeros((len(half), len(FUNCTIONS) + 2))
+    X = np.column_stack([columns, others, nothing, error])
+    m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1] + others.shape[1])
+    extra = m.shared + np.arange(nothing.shape[1])
+    look = CloseLook(
+        m, Laws.of(CANDIDATES, {}, m.shared, m.none), (SCALE, BIAS),
+        {SCALE: extra, BIAS: extra}, {SCALE: GIVEN, BIAS: 1.0},
+    )  # fmt: skip
+    found = look.search()
+    pair = (min(SCALE, BIAS), max(SCALE, BIAS))
+    alone = max(found[SCALE,].evidence, found[BIAS,].evidence)
+    assert look.fit(pair).evidence > alone + 50.0
+    assert (pair in found) == both
 
 
 def test_wheels_of_both_sides_are_one_sensor() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
-from terrafusion.twin.gap.infer.predictive import Products, energies, metric
+from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, excess, metric
 from terrafusion.twin.gap.rollout.residuals import WhitenedRun, inner_products
 
 T, P, Q, N = 2, 3, 2, 65
@@ -123,3 +123,21 @@ def test_products_with_signatures_are_those_of_all_columns() -> None:
     found = Products.of(in_two_channels(X), X[:, T + P : T + P + Q])
     np.testing.assert_allclose(found.gram, X.T @ X)
     assert (found.states, found.shared) == (T, P)
+
+
+def test_what_is_within_expectation_is_no_excess() -> None:
+    rng, found = np.random.default_rng(9), list[tuple[float, float, float]]()
+    for _ in range(40):
+        X = rng.standard_normal((N, 11))
+        change = 3.0 * X[:, 0] + X[:, :10] @ rng.standard_normal(10)
+        values = list[float]()
+        for error in (X[:, 10], change + X[:, 10]):
+            own = np.column_stack([X[:, :10], error])
+            m, used = Metric(np.pad(own.T @ own, (0, 1)), 10), np.zeros(12)
+            values.append(excess(m))
+        used[:10] = np.linalg.lstsq(X[:, :10], change, rcond=None)[0]
+        found.append((values[0], values[1], excess(m, used)))
+    without, with_it, left = np.array(found).T
+    assert np.mean(without > 0.0) <= 0.1
+    assert (with_it > 100.0).all()
+    np.testing.assert_allclose(left, without, atol=1e-6)
