@@ -9,7 +9,7 @@ import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-from tests.architecture import PAGE, ROOT, drawn, imports, modules
+from tests.architecture import PAGE, ROOT, drawn, imports, modules, tree
 
 
 def assert_no_circle(graph: dict[str, set[str]]) -> None:
@@ -47,9 +47,7 @@ def test_files_are_small() -> None:
 def test_nothing_shipped_imports_a_test_or_a_study() -> None:
     for path in modules().values():
         assert "tests." not in "".join(
-            node.module or ""
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            if isinstance(node, ast.ImportFrom)
+            node.module or "" for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom)
         )
 
 
@@ -61,7 +59,7 @@ def test_the_drawing_is_of_these_imports() -> None:
 def test_no_two_public_classes_share_a_name() -> None:
     homes: dict[str, list[str]] = {}
     for name, path in modules().items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, []).append(name)
     assert {name: found for name, found in homes.items() if len(found) > 1} == {}

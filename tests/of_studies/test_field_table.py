@@ -213,15 +213,21 @@ def test_a_stopped_table_goes_on_and_what_it_has_can_be_collected(
     assert collect(tasks, tmp_path)[2] == tasks
 
 
-def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) -> None:
+def test_a_real_log_with_one_outage_and_a_log_that_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = os.environ.get("TERRAFUSION_DATA")
     if not root or not (Path(root) / "umich_husky").is_dir():
         pytest.skip("TERRAFUSION_DATA names no folder with umich_husky: the field logs are not at hand")
     logs = ["umich_husky/mair_mocap/trial7", "umich_husky/mair_mocap/trial2"]
     words = ["--out", str(tmp_path), "--modes", "fixed", "--starts", "1", "--logs", *logs]
-    command = [sys.executable, "-m", "tests.studies.field_table.table", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+
+    def table(*more: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["table", *words, *more])
+        assert field_table.main() == 0
+        return capsys.readouterr().out
+
+    table()
     with (tmp_path / "runs.csv").open(encoding="utf-8", newline="") as file:
         rows = {row["test"]: row for row in csv.DictReader(file)}
     assert set(rows) == {"whole", "aided", "outage 30 s"}
@@ -233,12 +239,10 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
     assert refused["log"] == logs[1]
     assert "no wheels" in refused["why"]
     before = (tmp_path / "runs.csv").read_bytes()
-    again = subprocess.run([*command, "--collect"], capture_output=True, text=True, check=False)
-    assert (again.returncode, (tmp_path / "runs.csv").read_bytes()) == (0, before)
-    more = subprocess.run(
-        [*command, "--collect", "--modes", "fixed", "robust"], capture_output=True, text=True, check=False
-    )
-    assert "2 of 4 logs and modes not run yet" in more.stdout
+    table("--collect")
+    assert (tmp_path / "runs.csv").read_bytes() == before
+    more = table("--collect", "--modes", "fixed", "robust")
+    assert "2 of 4 logs and modes not run yet" in more
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,17 @@ from tests.studies.unseen_gap.study import CLEAN, USUAL, lines, trials, vehicle_
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plant, "SECONDS", 20.0)
+def log(name: str = "", size: float = 0.0) -> Recording:
+    """A short one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plant, "SECONDS", 20.0)
+        return run(machine(0), Change(name, size), USUAL, 1)
 
 
-def log(name: str = "", size: float = 0.0, seed: int = 1) -> Recording:
-    return run(machine(0), Change(name, size), USUAL, seed)
+@pytest.fixture(scope="module")
+def plain() -> Recording:
+    """Of the robot as it is."""
+    return log()
 
 
 def way_m(recording: Recording) -> tuple[float, float]:
@@ -34,20 +38,20 @@ def way_m(recording: Recording) -> tuple[float, float]:
     return float(np.hypot(*np.diff(fixes, axis=0).T).sum()), float(rolled)
 
 
-def test_the_same_seed_is_the_same_log() -> None:
-    one, other = log(), log()
+def test_the_same_seed_is_the_same_log(plain: Recording) -> None:
+    one, other = plain, log()
     assert one.imu is not None
     assert other.imu is not None
     assert np.array_equal(one.imu.gyro_radps, other.imu.gyro_radps)
 
 
-def test_larger_wheels_go_further_than_they_roll() -> None:
-    (ahead, rolled), (further, as_far) = way_m(log()), way_m(log("wheel_radius", 0.1))
+def test_larger_wheels_go_further_than_they_roll(plain: Recording) -> None:
+    (ahead, rolled), (further, as_far) = way_m(plain), way_m(log("wheel_radius", 0.1))
     assert further / as_far == pytest.approx(1.1 * ahead / rolled, rel=0.03)
 
 
-def test_sensor_changes_leave_the_drive_alone() -> None:
-    plain, biased = log(), log("gyro_bias", 0.01)
+def test_sensor_changes_leave_the_drive_alone(plain: Recording) -> None:
+    biased = log("gyro_bias", 0.01)
     assert plain.gnss is not None
     assert biased.gnss is not None
     assert np.array_equal(plain.gnss.enu_m, biased.gnss.enu_m)
@@ -56,13 +60,13 @@ def test_sensor_changes_leave_the_drive_alone() -> None:
     assert biased.imu.gyro_radps[:, 2] - plain.imu.gyro_radps[:, 2] == pytest.approx(0.01, abs=1e-12)
 
 
-def test_late_commands_move_the_robot_later() -> None:
+def test_late_commands_move_the_robot_later(plain: Recording) -> None:
     def starts(recording: Recording) -> float:
         assert recording.wheels is not None
         fast = np.abs(recording.wheels.speed).max(axis=1) > 0.5
         return float(np.argmax(fast)) / machine(0).wheels_hz
 
-    assert starts(log("dead_time", 0.3)) - starts(log()) == pytest.approx(0.3, abs=0.06)
+    assert starts(log("dead_time", 0.3)) - starts(plain) == pytest.approx(0.3, abs=0.06)
 
 
 def test_every_robot_has_every_change_and_clean_runs_on_both_drives() -> None:

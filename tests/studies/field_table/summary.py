@@ -79,11 +79,16 @@ def ratio_of(own: Sequence[Run], other: Sequence[Run]) -> tuple[float | None, fl
     clusters = [np.array(found) for found in pairs.values()]
     if ratio is None or sum(map(len, clusters)) < 2:
         return ratio, None, None
-    rng, drawn = np.random.default_rng(0), np.empty(DRAWS)
-    for i in range(DRAWS):
+    rng, draws, both = np.random.default_rng(0), list[np.ndarray](), np.empty((DRAWS, 2))
+    for _ in range(DRAWS):
         chosen = [clusters[j] for j in rng.integers(len(clusters), size=len(clusters))]
-        both = np.median(np.vstack([c[rng.integers(len(c), size=len(c))] for c in chosen]), axis=0)
-        drawn[i] = both[0] / max(both[1], 1e-9)
+        draws.append(
+            np.concatenate([c[rng.integers(len(c), size=len(c))] if len(c) > 1 else c for c in chosen])
+        )
+    for size in {len(draw) for draw in draws}:  # medians of many draws at once
+        alike = [i for i, draw in enumerate(draws) if len(draw) == size]
+        both[alike] = np.median([draws[i] for i in alike], axis=1)
+    drawn = both[:, 0] / np.maximum(both[:, 1], 1e-9)
     return ratio, *percentile_interval(drawn)
 
 

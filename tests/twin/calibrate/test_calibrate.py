@@ -18,6 +18,7 @@ from terrafusion.twin.calibrate.log import prepare
 from terrafusion.twin.calibrate.model import Model, resolve
 from terrafusion.twin.calibrate.predict import predict
 from terrafusion.twin.calibrate.problem import Point, Problem, ResidualBlock
+from terrafusion.twin.calibrate.result import Calibration
 from terrafusion.twin.calibrate.suggest import suggest
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -56,6 +57,12 @@ def drive(seed: int = 3, noiseless: bool = False, slope_deg: float = 0.0, **chan
     return dataclasses.replace(run.recording, truth=None, truth_channels=())
 
 
+@functools.cache
+def fitted() -> Calibration:
+    """The fit of all numbers to the noisy drive."""
+    return calibrate(drive(), "elevate", SOIL, NAMES)
+
+
 def problem_of(recording: Recording, names: tuple[str, ...] = NAMES, **changes: float) -> Problem:
     model = nominal(**changes)
     known = resolve(names, model)
@@ -78,7 +85,7 @@ def test_on_a_slope_the_rest_before_the_drive_is_not_believed() -> None:
 
 
 def test_noisy_data_give_them_within_their_sigma() -> None:
-    found = calibrate(drive(), "elevate", SOIL, NAMES)
+    found = fitted()
     scores = [(found[name].value - value) / found[name].sigma for name, value in TRUTH.items()]
     assert np.max(np.abs(scores)) < 3.5
     assert all(found[name].sigma < 0.2 * found[name].value for name in NAMES)
@@ -111,7 +118,7 @@ def test_derivatives_of_the_residuals(slope_rad: float) -> None:
 
 
 def test_order_of_the_parameters_does_not_matter() -> None:
-    one = calibrate(drive(), "elevate", SOIL, NAMES)
+    one = fitted()
     other = calibrate(drive(), "elevate", SOIL, NAMES[::-1])
     for name in NAMES:
         assert other[name].value == pytest.approx(one[name].value, abs=0.05 * one[name].sigma)
@@ -119,7 +126,7 @@ def test_order_of_the_parameters_does_not_matter() -> None:
 
 
 def test_four_logs_halve_sigma() -> None:
-    one = calibrate(drive(), "elevate", SOIL, NAMES)
+    one = fitted()
     four = calibrate([drive(seed) for seed in range(3, 7)], "elevate", SOIL, NAMES)
     ratio = [four[name].sigma / one[name].sigma for name in NAMES]
     assert 0.4 < np.exp(np.mean(np.log(ratio))) < 0.62
@@ -208,7 +215,7 @@ def test_priors_and_ranges() -> None:
 
 
 def test_files_load_again(tmp_path) -> None:
-    found = calibrate(drive(), "elevate", SOIL, NAMES)
+    found = fitted()
     write_files(found, tmp_path, "elevate")
     assert load_vehicle(tmp_path / "vehicle.yaml") == found.model.vehicle
     assert load_soil(tmp_path / "soil.yaml") == found.model.soils[SOIL]

@@ -35,6 +35,8 @@ from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment
 from tests.twin.gap.runs import DRIVE, run, runs
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
+
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
 VEHICLE = load_vehicle("elevate")
 WIDE = {"wheel_radius/scale": 0.03}

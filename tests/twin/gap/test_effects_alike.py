@@ -10,6 +10,8 @@ from terrafusion.twin.gap.diagnose import diagnose
 from tests.twin.gap.runs import runs
 from tests.twin.gap.test_diagnose import VEHICLE, checked
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
+
 DRAG = {"motion_resistance", "drivetrain_friction", "mud_adhesion"}
 
 

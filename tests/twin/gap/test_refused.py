@@ -14,6 +14,8 @@ from terrafusion.twin.gap.diagnose import diagnose
 from tests.twin.gap.runs import runs
 from tests.twin.gap.test_diagnose import VEHICLE
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
+
 
 @pytest.fixture(scope="module")
 def references() -> list[Recording]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 import zlib
 from collections.abc import Iterator, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.gap.blind.answers import BlindCase
 from terrafusion.twin.gap.blind.plan import Trial
@@ -86,12 +88,16 @@ def breaking(runs: Any, references: Any, vehicle: Any, *, seed: int = 0) -> Fixe
     raise np.linalg.LinAlgError("singular")
 
 
+@functools.cache
+def _short_runs(seeds: tuple[int, ...]) -> tuple[Recording, ...]:
+    vehicle, soil = load_vehicle("elevate"), load_soil("gravel")
+    return tuple(record([RunSpec(vehicle, soil, (Segment(1.0),), seed=seed) for seed in seeds]))
+
+
 def short_cases(trials: Sequence[Trial]) -> Iterator[BlindCase]:
     """In place of `answers.cases`: recordings of a second each, all of one robot."""
-    vehicle, soil = load_vehicle("elevate"), load_soil("gravel")
-    runs = (
-        record([RunSpec(vehicle, soil, (Segment(1.0),), seed=t.seed % 997) for t in trials]) if trials else []
-    )
+    runs = _short_runs(tuple(t.seed % 997 for t in trials)) if trials else ()
+    vehicle = load_vehicle("elevate")
     return (BlindCase(t.trial, (run,), (), vehicle) for t, run in zip(trials, runs, strict=True))
 
 

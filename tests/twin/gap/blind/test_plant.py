@@ -120,10 +120,9 @@ def test_rest_is_rest() -> None:
 
 def test_slip_needs_force() -> None:
     """Without resistance a wheel rolls at the hub's speed; the slip grows with the drag to overcome."""
-    slips = []
-    for rolling in (-load_soil("asphalt").resistance.rolling, 0.0, 0.05):
-        h = simulate([spec("asphalt", (Segment(8.0, 1.0),), changes={"rolling": rolling})])[0]
-        slips.append(1.0 - h["u"][-1] / (h["speed"][-1].mean() * 0.175))
+    drags = (-load_soil("asphalt").resistance.rolling, 0.0, 0.05)
+    runs = simulate([spec("asphalt", (Segment(8.0, 1.0),), changes={"rolling": drag}) for drag in drags])
+    slips = [1.0 - h["u"][-1] / (h["speed"][-1].mean() * 0.175) for h in runs]
     assert slips[0] < slips[1] < slips[2]
     free = machine("asphalt", u=1.0, speed=1.0 / 0.175)
     free.n["rolling"], free.n["loop_p"] = 0.0 * free.n["rolling"], 0.0 * free.n["loop_p"]
@@ -153,14 +152,11 @@ def test_half_the_step_changes_little_and_half_of_that_less() -> None:
 
 def test_every_knob_turns_something_and_zero_is_absent() -> None:
     """A change of zero leaves every bit; any other value changes the log."""
-    base = record([spec(noiseless=False)], names=["a"])[0]
     sizes = {"suction_pa": 2000.0, "tack_pa": 2000.0, "cda_m2": 2.0, "cda_gust_m2": 2.0, "gust_n": 20.0}
     sizes |= {"limit": 0.9, "limit_foldback": 0.9, "sag_ohm": 2.0, "sag_root": 5.0}
-    made = record(
-        [spec(noiseless=False, changes={change: sizes.get(change, 0.1)}) for change in CHANGES],
-        names=["a"] * len(CHANGES),
-    )
-    without = record([spec(noiseless=False, changes=dict.fromkeys(CHANGES, 0.0))], names=["a"])[0]
+    changes = [{}, dict.fromkeys(CHANGES, 0.0), *({change: sizes.get(change, 0.1)} for change in CHANGES)]
+    specs = [spec(noiseless=False, changes=some) for some in changes]
+    base, without, *made = record(specs, names=["a"] * len(specs))
     assert differences(base, without) == []
     idle = [change for change, log in zip(CHANGES, made, strict=True) if not differences(base, log)]
     assert idle == []
@@ -168,7 +164,8 @@ def test_every_knob_turns_something_and_zero_is_absent() -> None:
 
 def test_batched_runs_equal_single_ones() -> None:
     """What else is computed in one call does not matter, to the bit."""
-    many = [spec(noiseless=False, seed=i) for i in range(3)]
+    drive = (Segment(0.5), Segment(2.0, 0.8, 0.5), Segment(1.0, 0.0, -0.8))
+    many = [spec(drive=drive, noiseless=False, seed=i) for i in range(3)]
     together = record(many)
     for i, one in enumerate(many):
         alone = record([one], names=[f"run-{i + 1}"])[0]

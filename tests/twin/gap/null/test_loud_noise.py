@@ -18,6 +18,8 @@ from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
+
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "track_width"])
 
 

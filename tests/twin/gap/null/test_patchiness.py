@@ -30,6 +30,8 @@ from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import DRIVE, run
 
+pytestmark = pytest.mark.usefixtures("fitted_once")
+
 CANDIDATES = Candidates.of(
     ["soil_strength", "motion_resistance", "left_right_friction", "gyro_bias", "wheel_radius", "track_width"]
 )
