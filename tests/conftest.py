@@ -19,6 +19,26 @@ hypothesis.settings.load_profile("fixed")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+LONGEST = (
+    "twin/gap/test_diagnose.py", "test_docs.py", "of_studies/test_survey.py", "twin/gap/blind/test_plant.py",
+    "twin/gap/infer/test_other_drives.py", "twin/gap/test_effects_alike.py",
+    "twin/gap/null/test_reference_twin.py", "of_studies/test_source_study_cluster.py",
+    "of_studies/test_soak.py", "of_studies/test_effect_sweep.py",
+)  # fmt: skip
+"""Files that take longest; they come first, or one of them would run alone at the end."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Files of many tests are not the long ones, though xdist takes them to be."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {Path(__file__).parent / name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a command left behind."""

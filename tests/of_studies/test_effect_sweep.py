@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from tests.studies import effect_sweep
 from tests.studies.effect_sweep import first_forms, main
 
 
-def test_a_sensors_change_is_named_with_its_size(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sensors_change_is_named_with_its_size(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(effect_sweep, "SEGMENTS", effect_sweep.SEGMENTS[:7])
     some = ["--effects", "gyro_scale", "--runs", "2", "--references", "5", "--sizes", "3"]
     assert main(some) == 0
     rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]

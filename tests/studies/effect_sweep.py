@@ -55,9 +55,8 @@ class Bench:
 
     def recorded(self, number: int, effects: Mapping[str, float]) -> Recording:
         """A run without a truth channel."""
-        drive = Scenario(
-            "exciting", 60.0, route=(RouteLeg(self.soil),), drive=tuple(DriveSegment(*s) for s in SEGMENTS)
-        )
+        seconds, segments = sum(s[0] for s in SEGMENTS), tuple(DriveSegment(*s) for s in SEGMENTS)
+        drive = Scenario("exciting", seconds, route=(RouteLeg(self.soil),), drive=segments)
         rng = np.random.default_rng([self.seed, number])
         own = {key: SPREAD * float(rng.standard_normal()) for key in GROUND}
         for key, value in effects.items():

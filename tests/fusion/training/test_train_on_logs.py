@@ -182,12 +182,12 @@ def test_labelled_logs_to_a_model_that_replay_and_live_use(tmp_path: Path) -> No
     assert json.loads(figures.read_text())["macro_f1"] > 0.9
     seen = CliRunner().invoke(terrain.app, ["eval", "--model", str(out), held[0], logs[0]])
     assert "was trained on 1 of these logs" in str(seen.exception)
-    for log, ground in zip(held, ("loose_sand", "asphalt"), strict=True):
-        replayed = tf.replay(log, terrain_model=out)
-        assert replayed.metrics["terrain"][ground] > 0.8
+    assert tf.replay(held[1], terrain_model=out).metrics["terrain"]["asphalt"] > 0.8
     words = [held[0], "--terrain-model", str(out), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(main.app, ["replay", *words])
     assert result.exit_code == 0, result.output
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["terrain"]["loose_sand"] > 0.8
     result = CliRunner().invoke(main.app, ["live", *words[:3]])
     assert result.exit_code == 0, result.output
     result = CliRunner().invoke(main.app, ["replay", *words, "--vehicle", "warthog"])

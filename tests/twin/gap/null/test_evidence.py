@@ -13,6 +13,7 @@ from terrafusion.twin.engine import compiler, native
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.null import reference_twin
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import DRIVE, run, runs
@@ -20,6 +21,10 @@ from tests.twin.gap.runs import DRIVE, run, runs
 
 @pytest.mark.skipif(not compiled(), reason="no C compiler")
 def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RUNS", "FIRST_STEPS", "STEPS"):  # the virtual machine takes seconds for a step of the fit
+        monkeypatch.setattr(reference_twin, name, 1)
+    monkeypatch.setattr(reference_twin, "STARTS", {})
+    monkeypatch.setattr(reference_twin, "LATER", ())
     short = dataclasses.replace(DRIVE, duration_s=9.0, drive=DRIVE.drive[:4])
     judged, *references = (run(number, drive=short) for number in (970, 975, 976))
     given, candidates = ([judged], references), Candidates.of(["gyro_bias"])
