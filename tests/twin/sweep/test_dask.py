@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,6 +44,13 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with scheduler(tmp_path_factory.mktemp("dask")) as address, worker(address), worker(address):
         wait_for_workers(address, 2)
         yield address
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The table of the sweep over drives of 20 s, from one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    return run_sweep(sweep_of(folder, duration_s=20), folder / "out")
 
 
 def test_a_cluster_gives_the_same_bits_as_one_process(cluster: str, tmp_path: Path) -> None:
@@ -121,11 +129,10 @@ def test_other_versions_are_reported(cluster: str, tmp_path: Path, monkeypatch: 
 
 
 def test_dead_workers_are_reported_and_nothing_finished_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executors, "WORKERLESS_S", 2.0)
     sweep = sweep_of(tmp_path, duration_s=20)
-    whole = run_sweep(sweep, tmp_path / "whole")
     with scheduler(tmp_path) as address:
         with worker(address) as only:
             wait_for_workers(address, 1)
@@ -143,9 +150,8 @@ def test_dead_workers_are_reported_and_nothing_finished_is_lost(
     assert again.equals(whole)
 
 
-def test_the_work_of_a_dead_worker_is_done_by_others(tmp_path: Path) -> None:
+def test_the_work_of_a_dead_worker_is_done_by_others(whole: Any, tmp_path: Path) -> None:
     sweep = sweep_of(tmp_path, duration_s=20)
-    whole = run_sweep(sweep, tmp_path / "whole")
     with scheduler(tmp_path) as address, worker(address), worker(address) as mortal:
         wait_for_workers(address, 2)
         table = run_sweep(

@@ -106,7 +106,7 @@ def test_a_killed_sweep_continues_without_loss(file: Path, tmp_path: Path, compu
 
 
 def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Path) -> None:
-    file.write_text(SWEEP.replace("[0, 3, 6, 9]", "{from: 0, to: 20, count: 2000}"))
+    file.write_text(SWEEP.replace("[0, 3, 6, 9]", "{from: 0, to: 20, count: 500}"))
     call = PROGRAM.replace("sys.argv[2]", "sys.argv[2], jobs=2").replace("; run", "\ntry: run")
     program = f"{call}\nexcept KeyboardInterrupt: print('stopped', file=sys.stderr)"
     # A child of a suite that was started in the background would inherit that interrupts are ignored.
