@@ -93,6 +93,12 @@ def own_forms(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("terrafusion.twin.effects.catalogue._OWN", {})
 
 
+@pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replays write no page: for tests of ordinary drives that do not look at it. It takes a second."""
+    monkeypatch.setattr("terrafusion.fusion.reports.replay.write_report", lambda *_, **__: None)
+
+
 @pytest.fixture(scope="session")
 def husky_bag() -> Path:
     """The public Husky bag, where the environment names the folder of field logs."""

@@ -48,10 +48,9 @@ def run_python(document: Path, line: int, code: str, session: dict[str, Any]) ->
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_report: None) -> Path:
     """An empty folder to work in. Reports have tests of their own and cost a third of the time: left out."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("terrafusion.fusion.reports.replay.write_report", lambda *_, **__: None)
     return tmp_path
 
 

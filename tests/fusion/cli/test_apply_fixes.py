@@ -11,7 +11,7 @@ import pytest
 
 from terrafusion.datasets.readers import open_recording
 
-pytestmark = pytest.mark.usefixtures("quick")
+pytestmark = pytest.mark.usefixtures("quick", "no_report")
 
 ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
 

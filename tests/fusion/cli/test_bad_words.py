@@ -98,6 +98,7 @@ def test_a_bag_cut_off_before_its_first_message(husky_bag: Path, tmp_path: Path,
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(
     ("share", "words"), [(0.1, "replay cut.bag --vehicle husky --out results"), (1.0, "convert cut.bag log")]
 )
@@ -119,6 +120,7 @@ def test_bag_without_a_channel(channel: str, told: str, good_log: Path, tmp_path
     assert outcome.refused("part.mcap", channel, told)
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(("share", "status"), [(0.0005, 1), (0.1, 1), (0.5, 0), (1.0, 0)])
 def test_truncated_mcap(share: float, status: int, good_log: Path, tmp_path: Path, terrafusion) -> None:
     """What is complete is read; a tenth has no complete chunk."""

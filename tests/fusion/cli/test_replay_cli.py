@@ -171,6 +171,7 @@ def test_husky(husky_bag: Path, tmp_path: Path, terrafusion) -> None:
     assert metrics["outages"] == []
 
 
+@pytest.mark.usefixtures("no_report")
 def test_grounds_are_written_with_the_name_of_the_robot(drive: Path, tmp_path: Path, terrafusion) -> None:
     grounds = tmp_path / "grounds.yaml"
     for _ in ("new", "known"):

@@ -95,6 +95,7 @@ def test_assumed_angles_are_where_learning_begins(sigma: float | None, of_yaw: f
     assert estimator.imu.mounting_rad == 1.5
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_corrected_imu_is_no_reason_for_doubt_and_none_to_refuse(
     run: Recording, tmp_path: Path, terrafusion
 ) -> None:

@@ -166,6 +166,7 @@ def test_a_model_of_another_robot_is_refused(model: TerrainModel) -> None:
         EstimatorConfig(as_vehicle("warthog").rig(), "warthog", terrain_model=model)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_labelled_logs_to_a_model_that_replay_and_live_use(tmp_path: Path) -> None:
     """A robot that the shipped model does not know, on ground of which that says `unknown`."""
     logs = []
