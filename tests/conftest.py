@@ -20,10 +20,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 LONGEST = (
-    "twin/gap/test_diagnose.py", "test_docs.py", "of_studies/test_survey.py", "twin/gap/blind/test_plant.py",
-    "twin/gap/infer/test_other_drives.py", "twin/gap/test_effects_alike.py",
-    "twin/gap/null/test_reference_twin.py", "of_studies/test_source_study_cluster.py",
-    "of_studies/test_soak.py", "of_studies/test_effect_sweep.py",
+    "twin/gap/test_diagnose.py", "test_docs.py", "fusion/training/test_train_on_logs.py",
+    "fusion/cli/test_replay_cli.py", "fusion/cli/test_init.py", "fusion/cli/test_demo_cli.py",
+    "of_studies/test_source_study_cluster.py", "fusion/estimator/test_gnss.py",
+    "twin/gap/blind/test_plant.py", "twin/gap/infer/test_other_drives.py", "twin/gap/test_effects_alike.py",
+    "of_studies/test_survey.py", "twin/gap/null/test_reference_twin.py",
 )  # fmt: skip
 """Files that take longest; they come first, or one of them would run alone at the end."""
 

