@@ -22,7 +22,6 @@ from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
-from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 
@@ -36,7 +35,6 @@ UNIX_SINCE_S = 1e9
 """Times beyond this are unix seconds, smaller ones seconds of the GPS week."""
 NEAR_S = 3600.0
 """Fixes of one drive with the wheels lie no farther off."""
-LEAST_R = 0.7
 SMOOTH_M = 0.1
 """99 % of the second differences of 10 Hz carrier-phase fixes stay below: 0.066 m; of single points 1.8 m."""
 SIGMA_FIXED_M, SIGMA_SINGLE_M = (0.01, 0.01, 0.02), (2.5, 2.5, 5.0)
@@ -49,8 +47,6 @@ USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
 CLASS = "MATLAB_class"
 """Attribute of each variable."""
-
-Placed = tuple[Array | None, list[str]]
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -98,7 +94,7 @@ def _recording(file: MatlabFile, request: Request) -> Recording:
         recording = recording.with_notes(
             f"{names}: the rover's own dead reckoning in its odom frame, no truth; left out"
         )
-    return _with_fixes(recording, file, request, t_wheels)
+    return _with_fixes(recording, file, t_wheels)
 
 
 def _clock(file: MatlabFile, name: str) -> Array:
@@ -120,24 +116,18 @@ def _columns(file: MatlabFile, names: list[str], rows: int, clock: str) -> Array
     return np.stack(columns, axis=-1)
 
 
-def _with_fixes(recording: Recording, file: MatlabFile, request: Request, t_wheels: Array) -> Recording:
-    """The recording with the fixes, their times from the file or, failing that, by the wheels."""
+def _with_fixes(recording: Recording, file: MatlabFile, t_wheels: Array) -> Recording:
+    """The recording with the fixes, where the file has their times."""
     if not file.has("llhGPS") and not file.has("ENUGPS"):
         return recording
     enu_m, datum, notes = _positions(file)
-    placed = times_in_file(file, len(enu_m), t_wheels)
-    if placed is None:
-        wheels = recording.wheels
-        assert wheels is not None
-        late_s = request.conventions.lag_s.get("wheels", 0.0)
-        placed = times_by_rows(enu_m, t_wheels, np.abs(wheels.speed).mean(axis=1), late_s)
-    t_s, how = placed
-    recording = recording.with_notes(*notes, *how)
-    if t_s is None:
-        return recording
+    times = times_in_file(file, len(enu_m), t_wheels)
+    if times is None:
+        return recording.with_notes(*notes, "gnss: no times in the file; left out")
+    t_s, how = times
     fix, sigma_m, why = fix_class_and_sigma(file, enu_m)
     gnss = Gnss(seconds_to_ns(t_s), enu_m, sigma_m, np.full(len(enu_m), fix, dtype=np.uint8))
-    return dataclasses.replace(recording, gnss=gnss, datum=datum).with_notes(why)
+    return dataclasses.replace(recording, gnss=gnss, datum=datum).with_notes(*notes, how, why)
 
 
 def _positions(file: MatlabFile) -> tuple[Array, tuple[float, float, float] | None, list[str]]:
@@ -168,18 +158,18 @@ def seconds_to_ns(seconds: Array) -> TimesNs:
     return whole.astype(np.int64) * 10**9 + np.rint((seconds - whole) * 1e9).astype(np.int64)
 
 
-def times_in_file(file: MatlabFile, rows: int, t_wheels: Array) -> Placed | None:
-    """Unix seconds (N,) of the fixes from the file's own clock, with how; None where it has none."""
+def times_in_file(file: MatlabFile, rows: int, t_wheels: Array) -> tuple[Array, str] | None:
+    """Unix seconds (N,) of the fixes, with how; None where the file has none."""
     for table in file.tables():
         time = table.get("time", np.zeros(0))
         if len(time) == rows > 1 and (np.diff(time) > 0.0).all() and time[0] >= 0.0 and time[-1] < WEEK_S:
             t_s = _of_week(time, float(t_wheels[0]))
             if abs(t_s[0] - t_wheels[0]) < NEAR_S:
-                return t_s, [_of_table(t_s, t_wheels)]
+                return t_s, _of_table(t_s, t_wheels)
     if file.has("tTGPS"):
         t_s = file.vector("tTGPS")
         if len(t_s) == rows and np.isfinite(t_s).all() and t_s.min(initial=np.inf) > UNIX_SINCE_S:
-            return t_s, ["gnss: times are those of receipt (tTGPS)"]
+            return t_s, "gnss: times are those of receipt (tTGPS)"
     return None
 
 
@@ -198,26 +188,6 @@ def _of_week(seconds: Array, near_unix_s: float) -> Array:
     week = round((near_unix_s - GPS_EPOCH_S - float(seconds[0])) / WEEK_S)
     gps_ns = np.rint(seconds * 1e9).astype(np.int64) + week * WEEK_S * 10**9
     return np.asarray(gps_to_unix_ns(gps_ns), dtype=float) * 1e-9
-
-
-def times_by_rows(enu_m: Array, t_wheels: Array, speed: Array, wheels_late_s: float) -> Placed:
-    """Times by the wheels' rows: fix i goes with wheel row i up to a constant shift, by the speeds.
-
-    `wheels_late_s` is by how much the wheels' own times are late; fixes are put on the true clock.
-    """
-    if len(t_wheels) < 2 or len(enu_m) < 2:
-        return None, ["gnss: no times in the file; left out"]
-    period = float(np.median(np.diff(t_wheels)))
-    extra = t_wheels[-1] + period * np.arange(1, max(len(enu_m) - len(t_wheels), 0) + 1)
-    t_s = np.concatenate([t_wheels, extra])[: len(enu_m)]
-    steps = np.hypot(*np.diff(enu_m[:, :2], axis=0).T) / np.diff(t_s)
-    lag = lag_between(t_wheels - t_s[0], speed, (t_s[1:] + t_s[:-1]) / 2.0 - t_s[0], steps)
-    if lag is None or lag.r < LEAST_R:
-        return None, ["gnss: no times in the file, and its speed does not follow the wheels; left out"]
-    return t_s - lag.seconds - wheels_late_s, [
-        f"gnss: no times in the file; fix i goes with wheel row i, {-lag.seconds:+.2f} s "
-        f"({-lag.high_s:+.2f} to {-lag.low_s:+.2f}, 95 %) by their speeds (r {lag.r:.2f})"
-    ]
 
 
 def fix_class_and_sigma(file: MatlabFile, enu_m: Array) -> tuple[Fix, Array, str]:

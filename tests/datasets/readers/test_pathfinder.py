@@ -252,37 +252,10 @@ def test_times_of_a_table_with_gaps(tmp_path: Path) -> None:
     np.testing.assert_allclose(r.datum, DATUM, atol=1e-6)
 
 
-def test_times_by_rows(tmp_path: Path, catalog_with: CatalogWith) -> None:
-    """Without any clock: the rows' constant shift is found by the speeds, and told with its interval."""
-    catalog_with("wvu_pathfinder", lag_s={"wheels": 0.0})
-    shift = 0.6
-    t = np.arange(0.0, SECONDS, 0.1)[:-10] + shift
-    r = open_recording(save(tmp_path / "any.mat", workspace() | fixes(t)))
-    assert r.gnss is not None
-    assert abs((r.gnss.t_ns[0] - r.wheels.t_ns[0]) * 1e-9 - shift) < 0.05  # type: ignore[union-attr]
-    assert any(
-        "no times in the file; fix i goes with wheel row i, +0.6" in note and "95 %" in note
-        for note in r.notes
-    )
-
-
-def test_late_wheels_do_not_pull_the_fixes(tmp_path: Path, catalog_with: CatalogWith) -> None:
-    """Fixes placed by wheels that are late by 0.3 s come out on the true clock."""
-    catalog_with("wvu_pathfinder", lag_s={"wheels": 0.3})
-    table = workspace()
-    table["tTodom"] = table["tTodom"] + 0.3
-    t = np.arange(0.0, SECONDS, 0.1)[:-10] + 0.5
-    r = open_recording(save(tmp_path / "any.mat", table | fixes(t)))
-    assert r.gnss is not None
-    assert abs(r.gnss.t_ns[0] * 1e-9 - START_S - 0.5) < 0.05
-
-
-def test_fixes_without_a_clock_or_likeness_are_left_out(tmp_path: Path) -> None:
-    table = workspace() | fixes(np.arange(0.0, SECONDS, 0.1))
-    table["llhGPS"][:, :2] += np.random.default_rng(5).normal(0.0, 1e-6, (len(table["llhGPS"]), 2))
-    r = open_recording(save(tmp_path / "any.mat", table))
+def test_fixes_without_times_are_left_out(tmp_path: Path) -> None:
+    r = open_recording(save(tmp_path / "any.mat", workspace() | fixes(np.arange(0.0, SECONDS, 0.1))))
     assert r.gnss is None
-    assert any("does not follow the wheels; left out" in note for note in r.notes)
+    assert any("no times in the file; left out" in note for note in r.notes)
 
 
 def test_sigmas_and_times_of_receipt(tmp_path: Path) -> None:
