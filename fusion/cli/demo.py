@@ -48,7 +48,7 @@ def demo(
     from terrafusion.datasets.readers import open_recording
     from terrafusion.datasets.writers.log_folder import write_log_folder
     from terrafusion.fusion.reports.demo import plot_drives, table_of
-    from terrafusion.fusion.reports.replay import write_comparison, write_replay
+    from terrafusion.fusion.reports.replay import write_replay, write_report
     from terrafusion.twin.executors import open_workers
     from terrafusion.twin.simulate import simulate
 
@@ -66,7 +66,7 @@ def demo(
     results = [by_mode[mode] for mode in MODES]
     for result in results:
         write_replay(out / result.mode, result)
-    write_comparison(out / "report.html", TITLE, results, more=lambda sheet: plot_drives(sheet, runs))
+    write_report(out / "report.html", TITLE, results, more=lambda sheet: plot_drives(sheet, runs))
     document: dict[str, Any] = {mode: read_json(out / mode / "metrics.json") for mode in MODES}
     table = table_of(runs, results[0].outages[0])
     document["drives"] = {"seeds": [seed + i for i in range(drives)], "errors_m": table}

@@ -122,15 +122,13 @@ def plot_weights(sheet: Sheet, estimate: Estimate, *, marked: Sequence[WeightCha
             )  # fmt: skip
 
 
-def plot_speeds(
-    sheet: Sheet, estimate: Estimate, recording: Recording, *, wheel_radius_m: float | None = None
-) -> None:
+def plot_speeds(sheet: Sheet, estimate: Estimate, recording: Recording, wheel_radius_m: float) -> None:
     """Forward speed of the wheels and as estimated, and of GNSS and truth where there are any."""
     plot = sheet.add_time("speeds", "forward speed, m/s", 220)
     wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
     colours = style.SENSOR_COLOURS
-    if wheels is not None and len(wheels) and (wheels.unit == "mps" or wheel_radius_m is not None):
-        speed = wheels.side_speeds_mps(wheel_radius_m or 1.0).mean(axis=1)
+    if wheels is not None and len(wheels):
+        speed = wheels.side_speeds_mps(wheel_radius_m).mean(axis=1)
         plot.line(sheet.seconds(wheels.t_ns), speed, "wheels", colours["wheels"], width=1.0)
     if gnss is not None and gnss.velocity_enu_mps is not None:
         speed = np.hypot(gnss.velocity_enu_mps[:, 0], gnss.velocity_enu_mps[:, 1])

@@ -16,7 +16,7 @@ SHORT = "description: two metres\ndrive:\n  - {duration_s: 4, v_mps: 0.5}\nroute
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working folder with a short scenario. Reports have tests of their own."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("terrafusion.fusion.reports.replay.write_comparison", lambda *_, **__: None)
+    monkeypatch.setattr("terrafusion.fusion.reports.replay.write_report", lambda *_, **__: None)
     (tmp_path / "short.yaml").write_text(SHORT)
     return tmp_path
 

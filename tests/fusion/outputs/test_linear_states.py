@@ -26,7 +26,7 @@ from terrafusion.fusion.outputs.replay_files import estimate_columns, metrics_of
 from terrafusion.fusion.outputs.ros_estimate import written_estimate
 from terrafusion.fusion.reports.plots.replay import plot_skid_steering
 from terrafusion.fusion.reports.plots.sheet import Sheet
-from terrafusion.fusion.reports.replay import ReportRun, write_report
+from terrafusion.fusion.reports.replay import write_report
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from tests.fusion.replayed import result_of
@@ -104,8 +104,8 @@ def test_the_report_says_what_was_observed_and_what_could_not_be(drive: Any, tmp
     pages = []
     for calibrated in (False, True):
         estimate = with_states(d.estimate, calibrated)
-        run = ReportRun("adaptive", metrics_for(d, estimate), estimate, score(estimate, d.recording))
-        page = write_report(tmp_path / f"{calibrated}.html", "Replay", [run], d.recording)
+        run = result_of(d.recording, estimate, score(estimate, d.recording))
+        page = write_report(tmp_path / f"{calibrated}.html", "Replay", [run])
         pages.append(page.read_text(encoding="utf-8"))
     assert all("Yaw scale: true over wheel yaw rate" in page for page in pages)
     assert ["<h2>Calibration</h2>" in page for page in pages] == [False, True]

@@ -23,7 +23,7 @@ from terrafusion.fusion.reports.plots import replay_map as plots_map
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Sheet, compact
 from terrafusion.fusion.reports.plots.style import colour_of, label_text, thin
-from terrafusion.fusion.reports.replay import ReportRun, write_report
+from terrafusion.fusion.reports.replay import write_report
 from terrafusion.fusion.reports.replay_text import ScoreRow, pick_pair, score_rows, summary_of_many
 from tests.fusion.replayed import result_of
 from tests.fusion.reports.browser import BROWSER, assert_drawn
@@ -40,8 +40,7 @@ def make_run(d, name, recording=None, *, outages=OUTAGES, log="synthetic", **cha
     scores = score(estimate, recording, held_out=d.fixes, outages=outages)
     named = dataclasses.replace(recording, name=log)
     mode = name if name in ("adaptive", "fixed") else "robust"
-    metrics = metrics_of(result_of(named, estimate, scores, mode=mode))
-    return ReportRun(name, metrics, estimate, scores)
+    return result_of(named, estimate, scores, mode=mode, held_out=d.fixes, outages=outages)
 
 
 class Page(HTMLParser):
@@ -82,15 +81,7 @@ def parse(path):
 def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
     good, bad = drive(drift_mps=0.005), drive(drift_mps=0.03)
     runs = [make_run(good, "adaptive"), make_run(bad, "fixed")]
-    path = write_report(
-        tmp_path / "report.html",
-        "Two runs",
-        runs,
-        good.recording,
-        held_out=good.fixes,
-        outages=OUTAGES,
-        provenance={"command": "terrafusion demo", "policy": "ab" * 32},
-    )
+    path = write_report(tmp_path / "report.html", "Two runs", runs, {"command": "terrafusion demo"})
     page = parse(path)
     assert page.headings == [
         "Drive",
@@ -118,7 +109,7 @@ def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
 def test_one_run_needs_no_comparison(drive, tmp_path):
     d = drive(drift_mps=0.01)
     run = make_run(d, "adaptive")
-    path = write_report(tmp_path / "r.html", "Replay", [run], d.recording, outages=OUTAGES)
+    path = write_report(tmp_path / "r.html", "Replay", [run])
     text = path.read_text(encoding="utf-8")
     assert "error_runs" in parse(path).plots
     assert "against fixed" not in text
@@ -137,9 +128,7 @@ def test_what_comes_from_a_log_is_escaped(drive, tmp_path):
         terrain=Terrain(d.recording.truth.t_ns[:1], np.array([HOSTILE], dtype=object), source=HOSTILE),
     )
     run = make_run(d, HOSTILE, recording, log=HOSTILE, classes=classes, changes=changes, notes=(HOSTILE,))
-    path = write_report(
-        tmp_path / "r.html", HOSTILE, [run], recording, outages=OUTAGES, provenance={HOSTILE: HOSTILE}
-    )
+    path = write_report(tmp_path / "r.html", HOSTILE, [run], {HOSTILE: HOSTILE})
     parse(path)
     text = path.read_text(encoding="utf-8")
     assert "<script>alert" not in text
@@ -151,7 +140,7 @@ def test_a_drive_that_cannot_be_scored_still_has_a_report(drive, tmp_path):
     recording = Recording(name="bare", start_ns=d.recording.start_ns)
     bare = dataclasses.replace(d, recording=recording, fixes=d.fixes.select(slice(0, 0)))
     run = make_run(bare, "fixed", innovations=(), changes=(), notes=())
-    path = write_report(tmp_path / "r.html", "Bare", [run], recording, outages=OUTAGES)
+    path = write_report(tmp_path / "r.html", "Bare", [run])
     text = path.read_text(encoding="utf-8")
     assert "could not be scored" in text
     assert "No weight changed" in text
@@ -161,13 +150,13 @@ def test_a_drive_that_cannot_be_scored_still_has_a_report(drive, tmp_path):
 def test_the_same_runs_give_the_same_page(drive, tmp_path):
     d = drive(seconds=20.0)
     run = make_run(d, "adaptive")
-    pages = [write_report(tmp_path / f"{i}.html", "t", [run], d.recording).read_bytes() for i in range(2)]
+    pages = [write_report(tmp_path / f"{i}.html", "t", [run]).read_bytes() for i in range(2)]
     assert pages[0] == pages[1]
 
 
 def test_losses_are_worded_like_wins(drive):
     good, bad = make_run(drive(drift_mps=0.005), "fixed"), make_run(drive(drift_mps=0.03), "adaptive")
-    metrics = [good.metrics, bad.metrics]
+    metrics = [metrics_of(good), metrics_of(bad)]
     ours, theirs = pick_pair(metrics)
     assert (ours, theirs) == (1, 0)
     row = score_rows(metrics)[0]
@@ -237,7 +226,7 @@ def test_lines_stand_out_on_a_light_and_on_a_dark_page():
 def test_a_browser_draws_the_page_without_a_complaint(drive, tmp_path):
     d = drive(seconds=20.0)
     run = make_run(d, "adaptive")
-    assert_drawn(write_report(tmp_path / "r.html", "t", [run], d.recording, outages=OUTAGES))
+    assert_drawn(write_report(tmp_path / "r.html", "t", [run]))
 
 
 def test_plots_bear_gaps_nan_and_single_keyframes(drive):
@@ -269,7 +258,7 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
         plots.plot_weights(sheet, estimate)
         plots_filter.plot_biases(sheet, estimate)
         plots_filter.plot_innovations(sheet, estimate)
-        plots.plot_speeds(sheet, estimate, recording)
+        plots.plot_speeds(sheet, estimate, recording, 0.175)
         plots_map.plot_map(sheet, runs, "a", recording, COLOURS, errors={}, held_out=none)
         page = json.loads(sheet.json())  # JSON itself knows no NaN
         assert len(page["render"][0]["roots"]) == len(sheet.panels)
@@ -334,7 +323,7 @@ def test_a_report_on_a_long_drive_is_quick(drive, tmp_path):
     d = drive(seconds=400.0, truth_hz=100, noise_m=0.05)
     runs = [make_run(d, "adaptive"), make_run(d, "fixed")]
     begun = time.process_time()
-    path = write_report(tmp_path / "r.html", "Long", runs, d.recording, held_out=d.fixes, outages=OUTAGES)
+    path = write_report(tmp_path / "r.html", "Long", runs)
     assert time.process_time() - begun < 10.0
     assert path.stat().st_size < 3_000_000
 
