@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import pandas as pd
 
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, write_page
 from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.fusion.reports.plots.sweep import LABELS, draw
-from terrafusion.fusion.reports.plots.sweep_cells import Columns, columns_of, mobile, varied
+from terrafusion.fusion.reports.plots.sweep_cells import varied, with_mobile
 
 if TYPE_CHECKING:
     from terrafusion.twin.sweep.plan import Sweep
@@ -45,9 +45,9 @@ def write_sweep_report(
 
     `provenance` are further lines for the last section. A TerrafusionError where the file cannot be written.
     """
-    columns = columns_of(table)
+    runs = with_mobile(table.to_pandas())
     sheet = Sheet()
-    groups = draw(sheet, columns)
+    groups = draw(sheet, runs)
     about = f"{sweep.description[:1].upper()}{sweep.description[1:]}. " if sweep.description else ""
     made_of = {
         "scenario": sweep.scenario.name, "vehicle": sweep.vehicle.name, "sha256 of the sweep": sweep.sha256(),
@@ -56,75 +56,66 @@ def write_sweep_report(
         out / "report.html", "sweep.html.j2", f"Sweep {sweep.name}",
         lead=f"{about}{sweep.vehicle.name} drives {sweep.scenario.name}: {sweep.design()}.",
         provenance=made_of | dict(provenance or {}), packages=(*TWIN_LIBRARIES, "pyarrow"),
-        verdicts=[_verdict(columns)], tiles=_tiles(columns), statistics=_statistics(columns), groups=groups,
-        failures=_failures(columns), **sheet.parts(),
+        verdicts=[_verdict(runs)], tiles=_tiles(runs), statistics=_statistics(runs), groups=groups,
+        failures=_failures(runs), **sheet.parts(),
     )  # fmt: skip
 
 
-def _verdict(columns: Columns) -> VerdictBox:
+def _verdict(runs: pd.DataFrame) -> VerdictBox:
     """How many runs drove on to the end, how the others ended, and what that depends on."""
-    status = columns["status"]
-    counts = {word: int((status == word).sum()) for word in MEANINGS}
-    value = (
-        "not_to_be_used" if counts["failed"] == len(status) else "doubtful" if counts["failed"] else "good"
-    )
+    counts = {word: int((runs["status"] == word).sum()) for word in MEANINGS}
+    value = "not_to_be_used" if counts["failed"] == len(runs) else "doubtful" if counts["failed"] else "good"
     others = [word for word in MEANINGS if word != "done" and counts[word]]
     reasons = [f"{counts[word]} {MEANINGS[word]}." for word in others]
-    reasons += [_along(columns, name) for name in varied(columns)]
-    if len(set(columns["terrain"])) > 1:
-        reasons.append(_along(columns, "terrain"))
-    title = f"{counts['done']} of {len(status)} runs are mobile: they drove on to the end"
+    reasons += [_along(runs, name) for name in varied(runs)]
+    if runs["terrain"].nunique() > 1:
+        reasons.append(_along(runs, "terrain"))
+    title = f"{counts['done']} of {len(runs)} runs are mobile: they drove on to the end"
     return VerdictBox(value, title, [reason for reason in reasons if reason])
 
 
-def _along(columns: Columns, name: str) -> str:
+def _along(runs: pd.DataFrame, name: str) -> str:
     """The share of mobile runs at the ends of an axis, or on the best and the worst terrain."""
-    run = mobile(columns)
-    known = np.isfinite(run)
-    shares = {
-        at: float(run[known & (columns[name] == at)].mean()) for at in dict.fromkeys(columns[name][known])
-    }
-    if not shares:
+    shares = runs.groupby(name, sort=name != "terrain")["mobile"].mean().dropna()
+    if not len(shares):
         return ""
     if name == "terrain":
-        label, order = "Terrain", sorted(shares, key=lambda at: -shares[at])
-        ends = [f"on {order[0]}", f"on {order[-1]}"]
+        shares = shares.sort_values(ascending=False, kind="stable")
+        label, ends = "Terrain", [f"on {at}" for at in shares.index[[0, -1]]]
     else:
-        label, order = LABELS[name].capitalize(), sorted(shares)
-        ends = [f"at {order[0]:g}", f"at {order[-1]:g}"]
-    best, worst = (f"{100.0 * shares[at]:.0f} %" for at in (order[0], order[-1]))
+        label, ends = LABELS[name].capitalize(), [f"at {at:g}" for at in shares.index[[0, -1]]]
+    best, worst = (f"{100.0 * share:.0f} %" for share in shares.iloc[[0, -1]])
     return f"{label}: {best} of the runs are mobile {ends[0]}, {worst} {ends[1]}."
 
 
-def _tiles(columns: Columns) -> list[Tile]:
+def _tiles(runs: pd.DataFrame) -> list[Tile]:
     """Share of mobile runs, and what a metre costs them."""
-    good, known = columns["status"] == "done", columns["status"] != "failed"
-    share = f"{100.0 * good.sum() / known.sum():.0f} %" if known.any() else number(None)
-    found = [Tile("mobile runs", share, f"{good.sum()} of {known.sum()} that could be computed")]
+    good, known = runs[runs["status"] == "done"], runs["mobile"].count()
+    share = f"{100.0 * len(good) / known:.0f} %" if known else number(None)
+    found = [Tile("mobile runs", share, f"{len(good)} of {known} that could be computed")]
     for name, label, factor in (
         ("mean_slip_ratio", "slip ratio, %", 100.0),
         ("energy_per_m_j", "energy, J/m", 1.0),
     ):
-        values = factor * columns[name][good & np.isfinite(columns[name])]
+        values = factor * good[name].dropna()
         if len(values):
-            low, high = values.min(), values.max()
-            about = f"median of the mobile runs, {number(float(low))} to {number(float(high))}"
-            found.append(Tile(label, number(float(np.median(values))), about))
+            about = f"median of the mobile runs, {number(values.min())} to {number(values.max())}"
+            found.append(Tile(label, number(values.median()), about))
     return found
 
 
-def _statistics(columns: Columns) -> list[list[str]]:
+def _statistics(runs: pd.DataFrame) -> list[list[str]]:
     rows = []
     for name, label, factor in _STATISTICS:
-        values = factor * columns[name][np.isfinite(columns[name])] if name in columns else np.empty(0)
+        values = factor * runs.get(name, pd.Series(dtype=float)).dropna()
         if len(values):
-            cells = [*np.percentile(values, [0.0, 25.0, 50.0, 75.0, 100.0]), len(values)]
+            cells = [*values.quantile([0.0, 0.25, 0.5, 0.75, 1.0]), len(values)]
             rows.append([label, *(f"{value:.4g}" for value in cells)])
     return rows
 
 
-def _failures(columns: Columns) -> list[str]:
-    failed = np.flatnonzero(columns["status"] == "failed")
+def _failures(runs: pd.DataFrame) -> list[str]:
+    failed = runs[runs["status"] == "failed"]["error"]
     more = len(failed) - MOST_FAILURES
-    shown = [f"run {row}: {columns['error'][row]}" for row in failed[:MOST_FAILURES]]
+    shown = [f"run {row}: {error}" for row, error in failed.head(MOST_FAILURES).items()]
     return [*shown, f"and {more} more"] if more > 0 else shown

@@ -8,23 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
-from terrafusion.fusion.reports.plots.sweep_cells import (
-    CellAxis,
-    Columns,
-    in_cells,
-    levels,
-    mobile,
-    per_cell,
-    plane_of,
-    select,
-    share_mobile,
-    varied,
-)
+from terrafusion.fusion.reports.plots.sweep_cells import CellAxis, in_cells, plane_of, varied
 
 LABELS = {
     "friction": "effective friction",
@@ -42,10 +31,10 @@ Group = tuple[str, list[str], str]
 """Title, keys of the figures that stand side by side, and their caption."""
 
 
-def draw(sheet: Sheet, columns: Columns) -> list[Group]:
+def draw(sheet: Sheet, runs: pd.DataFrame) -> list[Group]:
     """All figures that fit a sweep."""
     groups: list[Group] = []
-    plane, axes = plane_of(columns), varied(columns)
+    plane, axes = plane_of(runs), varied(runs)
     if plane is not None:
         others = [LABELS[name].split(",")[0] for name in axes if name not in plane]
         over = f", medians over {' and '.join(others)}" if others else ""
@@ -53,25 +42,33 @@ def draw(sheet: Sheet, columns: Columns) -> list[Group]:
             f"Slip and energy where every run is mobile, and the share of mobile runs{over}. "
             "On the line half of the runs are mobile. Grey: no value."
         )
-        for i, terrain in enumerate(list(dict.fromkeys(columns["terrain"]))[:MAX_GROUPS]):
-            part = select(columns, columns["terrain"] == terrain)
+        for i, (terrain, part) in enumerate(_by_terrain(runs)[:MAX_GROUPS]):
             maps = plot_maps(sheet, f"map{i}", part, plane)
             groups.append((style.label_text(terrain), maps, "" if i else caption))
-        plot_mobility(sheet, columns, plane)
+        plot_mobility(sheet, runs, plane)
         groups.append(("Limit of mobility", ["mobility"], "Lines on which half of the runs are mobile."))
     elif axes:
-        plot_profile(sheet, columns, axes[0])
+        plot_profile(sheet, runs, axes[0])
         keys = ["profile_slip", "profile_energy", "profile_share"]
         groups.append(("Profile", keys, "Medians of the mobile runs, and their share."))
-    left_out = int((columns["status"] != "done").sum())
-    if left_out < len(columns["status"]):
-        plot_energy_slip(sheet, columns)
+    left_out = int((runs["status"] != "done").sum())
+    if left_out < len(runs):
+        plot_energy_slip(sheet, runs)
         caption = "One dot a mobile run." + (f" {left_out} others are left out." if left_out else "")
         groups.append(("Energy against slip", ["energy_slip"], caption))
     return groups
 
 
-def plot_maps(sheet: Sheet, key: str, columns: Columns, plane: tuple[str, str]) -> list[str]:
+def _by_terrain(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The runs on each terrain, in order of appearance."""
+    return [(str(terrain), part) for terrain, part in runs.groupby("terrain", sort=False)]
+
+
+def _cell_axes(runs: pd.DataFrame, plane: tuple[str, str]) -> dict[str, CellAxis]:
+    return {name: CellAxis.of(runs[name]) for name in plane}
+
+
+def plot_maps(sheet: Sheet, key: str, runs: pd.DataFrame, plane: tuple[str, str]) -> list[str]:
     """Slip, energy per metre, share of mobile runs over two axes, with the limit of mobility; their keys.
 
     Slip and energy are medians over cells in which every run is mobile: medians of survivors would look
@@ -79,10 +76,11 @@ def plot_maps(sheet: Sheet, key: str, columns: Columns, plane: tuple[str, str]) 
     """
     from bokeh.palettes import Cividis256, Magma256, Viridis256
 
-    x, y = CellAxis.of(columns[plane[0]]), CellAxis.of(columns[plane[1]])
-    share = share_mobile(columns, x, y, plane)
+    axes = _cell_axes(runs, plane)
+    x, y = axes.values()
+    share = in_cells(runs, "mobile", "mean", axes)
     slip, energy = (
-        np.where(share == 1.0, in_cells(columns, columns[name], x, y, plane), np.nan)
+        np.where(share == 1.0, in_cells(runs, name, "median", axes), np.nan)
         for name in ("mean_slip_ratio", "energy_per_m_j")
     )
     log = bool(np.nanmax(energy, initial=1.0) > 5.0 * np.nanmin(energy, initial=np.inf))
@@ -98,19 +96,23 @@ def plot_maps(sheet: Sheet, key: str, columns: Columns, plane: tuple[str, str]) 
     return [f"{key}_slip", f"{key}_energy", f"{key}_share"]
 
 
-def plot_mobility(sheet: Sheet, columns: Columns, plane: tuple[str, str]) -> None:
+def plot_mobility(sheet: Sheet, runs: pd.DataFrame, plane: tuple[str, str]) -> None:
     """The limit of mobility of each terrain and payload: the line on which half of the runs are mobile."""
-    x, y = CellAxis.of(columns[plane[0]]), CellAxis.of(columns[plane[1]])
+    axes = _cell_axes(runs, plane)
+    x, y = axes.values()
     limits: dict[str, Any] = {"x_range": (x.edges[0], x.edges[-1]), "y_range": (y.edges[0], y.edges[-1])}
     plot = sheet.add("limits mobility", LABELS[plane[0]], LABELS[plane[1]], **limits)
-    for terrain, payload, rows in _groups(columns, plane):
-        rank = 0 if payload is None else int(np.searchsorted(levels(columns["payload_kg"]), payload))
+    payloads = sorted(runs["payload_kg"].dropna().unique())
+    split = 1 < len(payloads) <= 4 and "payload_kg" not in plane
+    for terrain, part in _by_terrain(runs)[:MAX_GROUPS]:
         colour = style.line_colour(style.terrain_colour(terrain))
-        share = share_mobile(select(columns, rows), x, y, plane)
-        label = style.label_text(terrain if payload is None else f"{terrain}, {payload:g} kg")
-        if not _limit_line(plot, x, y, share, label, colour, DASHES[rank % len(DASHES)]):
-            none = "all mobile" if np.nanmin(share, initial=1.0) > 0.5 else "no limit found"
-            plot.note(f"{label}: {none}", colour, "line")
+        for rank, payload in enumerate(payloads if split else [None]):
+            mine = part if payload is None else part[part["payload_kg"] == payload]
+            share = in_cells(mine, "mobile", "mean", axes)
+            label = style.label_text(terrain if payload is None else f"{terrain}, {payload:g} kg")
+            if not _limit_line(plot, x, y, share, label, colour, DASHES[rank]):
+                none = "all mobile" if np.nanmin(share, initial=1.0) > 0.5 else "no limit found"
+                plot.note(f"{label}: {none}", colour, "line")
     if plane == ("friction", "slope_deg"):
         friction = np.linspace(x.edges[0], x.edges[-1], 200)
         slope = np.degrees(np.arctan(friction))
@@ -118,41 +120,40 @@ def plot_mobility(sheet: Sheet, columns: Columns, plane: tuple[str, str]) -> Non
     _level_ticks(plot, x, y)
 
 
-def plot_energy_slip(sheet: Sheet, columns: Columns) -> None:
+def plot_energy_slip(sheet: Sheet, runs: pd.DataFrame) -> None:
     """Energy per metre against mean slip of the mobile runs, coloured by terrain."""
     from bokeh.models import BasicTickFormatter
 
-    good = select(columns, (columns["status"] == "done") & np.isfinite(columns["energy_per_m_j"]))
+    good = runs[(runs["status"] == "done") & runs["energy_per_m_j"].notna()]
     plot = sheet.add("runs energy_slip", SLIP, ENERGY, 360, y_axis_type="log")
     plot.panel.figure.yaxis.formatter = BasicTickFormatter()
-    rows = style.thin(len(good["terrain"]), MOST_DOTS)
-    names = [name for name in LABELS if len(levels(good[name])) > 1]
+    names = [name for name in LABELS if good[name].nunique() > 1]
     tips = {"slip, energy": "@x{0.#} %, @y{0.#} J/m"} | {LABELS[name]: f"@{name}{{0.###}}" for name in names}
-    for terrain in dict.fromkeys(good["terrain"]):
-        here = rows[good["terrain"][rows] == terrain]
-        data = {"x": 100.0 * good["mean_slip_ratio"][here], "y": good["energy_per_m_j"][here]}
+    shown = good.iloc[style.thin(len(good), MOST_DOTS)]
+    for terrain in good["terrain"].unique():
+        part = shown[shown["terrain"] == terrain]
+        data = {"x": 100.0 * part["mean_slip_ratio"].to_numpy(), "y": part["energy_per_m_j"].to_numpy()}
         colour, label = style.line_colour(style.terrain_colour(terrain)), style.label_text(terrain)
-        more = {name: good[name][here] for name in names}
+        more = {name: part[name].to_numpy() for name in names}
         plot.glyph("scatter", data, label, colour, "dot", more=more, tips=tips, size=6.0, fill_alpha=0.6)
 
 
-def plot_profile(sheet: Sheet, columns: Columns, axis: str) -> None:
+def plot_profile(sheet: Sheet, runs: pd.DataFrame, axis: str) -> None:
     """Slip, energy per metre and the share of mobile runs along one axis, a line a terrain."""
-    x = CellAxis.of(columns[axis])
-    n = len(x.centres)
+    axes = {axis: CellAxis.of(runs[axis])}
+    x = axes[axis].centres
     titles = {"slip": SLIP, "energy": ENERGY, "share": SHARE}
     plots = {key: sheet.add(f"p profile_{key}", LABELS[axis], label, 260) for key, label in titles.items()}
-    for terrain in dict.fromkeys(columns["terrain"]):
-        part = select(columns, columns["terrain"] == terrain)
-        good = select(part, part["status"] == "done")
+    for terrain, part in _by_terrain(runs):
+        good = part[part["status"] == "done"]
         colour, label = style.line_colour(style.terrain_colour(terrain)), style.label_text(terrain)
         for key, values in (
-            ("slip", 100.0 * per_cell(x.cells(good[axis]), good["mean_slip_ratio"], n, "median")),
-            ("energy", per_cell(x.cells(good[axis]), good["energy_per_m_j"], n, "median")),
-            ("share", per_cell(x.cells(part[axis]), mobile(part), n, "mean")),
+            ("slip", 100.0 * in_cells(good, "mean_slip_ratio", "median", axes)),
+            ("energy", in_cells(good, "energy_per_m_j", "median", axes)),
+            ("share", in_cells(part, "mobile", "mean", axes)),
         ):
-            plots[key].line(x.centres, values, label, colour)
-            plots[key].dots(x.centres, values, label, colour, size=6.0)
+            plots[key].line(x, values, label, colour)
+            plots[key].dots(x, values, label, colour, size=6.0)
 
 
 def _limit_line(
@@ -169,20 +170,6 @@ def _limit_line(
         return False
     plot.line(np.asarray(found.xs[0]), np.asarray(found.ys[0]), label, colour, dash=dash, width=2.5)
     return True
-
-
-def _groups(columns: Columns, plane: tuple[str, str]) -> list[tuple[str, float | None, NDArray[np.bool_]]]:
-    """Runs of one terrain, split by payload where payloads are few and no axis of the plane."""
-    payloads = levels(columns["payload_kg"])
-    split = 1 < len(payloads) <= 4 and "payload_kg" not in plane
-    out: list[tuple[str, float | None, NDArray[np.bool_]]] = []
-    for terrain in list(dict.fromkeys(columns["terrain"]))[:MAX_GROUPS]:
-        here = columns["terrain"] == terrain
-        if split:
-            out += [(terrain, float(p), here & (columns["payload_kg"] == p)) for p in payloads]
-        else:
-            out.append((terrain, None, here))
-    return out
 
 
 def _level_ticks(plot: Plot, x: CellAxis, y: CellAxis) -> None:
