@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -131,7 +132,6 @@ def _shown(found: Calibration, vehicle: str, out: Path, suggest: bool) -> Result
 
 def _sensors(logs: list[str], vehicle: str | None, how: common.HowRead, out: Path) -> Result:
     """Learn the sensor numbers of a robot, and write its file."""
-    import dataclasses
 
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors

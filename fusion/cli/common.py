@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shlex
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.printable import printable
 from terrafusion.fusion.cli.usage import SHARED
 
@@ -124,8 +126,6 @@ def rig_of(recording: Recording, rig: Rig | None) -> Rig | None:
     """`rig`, else that of the vehicle the log itself names, where it is known here."""
     if rig is not None or not recording.vehicle:
         return rig
-    from terrafusion.datasets.core.errors import ConfigError
-
     try:
         return load_rig(recording.vehicle)
     except ConfigError:
@@ -196,8 +196,6 @@ def warn_of_log(log: str, recordings: Sequence[Recording]) -> None:
 
 def clock_accepted(recording: Recording) -> Recording:
     """The recording with its repaired clock steps as notes, so that the log checks accept it."""
-    import dataclasses
-
     notes = [
         f"{jump.channel}: its clock stood {jump.step_s:+.3f} s off from "
         f"t = {(jump.t_ns - recording.start_ns) * 1e-9:.2f} s on; taken out (--repair-clock)"
@@ -234,8 +232,6 @@ def write_log(recording: Recording, out: Path, rig: Rig | None = None) -> list[s
 
 def refuse_no_yaml(out: Path) -> None:
     """Refuse a name for a vehicle file that is none of a YAML file (ConfigError)."""
-    from terrafusion.datasets.core.errors import ConfigError
-
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
 
@@ -248,8 +244,6 @@ def refuse_impossible(log: str, recording: Recording) -> None:
 
 
 def _refuse(log: str, findings: list[Finding]) -> None:
-    from terrafusion.datasets.core.errors import DataError
-
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:
         return

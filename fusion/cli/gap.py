@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,8 +117,6 @@ def gap(
 
 def _opened_by_name(names: list[str], how: common.HowRead, rig: Rig | None) -> list[Recording]:
     """The logs, each called as it was given: drives of one scenario share the name in their files."""
-    import dataclasses
-
     found: list[Recording] = []
     for name in names:
         logs = how.open_all([name], rig)

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from terrafusion.datasets.core.errors import ConfigError, errors_of
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, document_of, result_lines
+from terrafusion.fusion.cli.inspect_page import print_lines
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
@@ -57,16 +60,7 @@ def init(
         mass (KG): Mass; only the twin uses it.
         no_verdict: Write the file only; do not replay the log with it.
     """
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.datasets.readers.ros.streams import decoded_once
-    from terrafusion.fusion.cli.init_page import (
-        ask,
-        choose_sensors,
-        contents_lines,
-        document_of,
-        result_lines,
-    )
-    from terrafusion.fusion.cli.inspect_page import print_lines
     from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import base_of, first_vehicle, generic_rig
 
@@ -148,7 +142,6 @@ def _next_commands(log: str, out: Path, again: str, repaired: bool) -> tuple[lis
 
 def _parsed(text: str, name: str) -> Any:
     """An answer; a malformed one is wrong usage (exit status 2)."""
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.init.answers import parse
     from terrafusion.fusion.init.geometry import FLAGS
 
@@ -171,7 +164,6 @@ def _write(out: Path, log: str, found: FirstVehicle) -> None:
 
 def _verdict(found: FirstVehicle, out: Path) -> Verdict:
     """The verdict on a replay of the log with the file."""
-    from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.replay import replay
 
     with common.progress_bar("replaying") as progress, errors_of(found.recording.name):

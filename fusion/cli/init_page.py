@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.cli.common import Line
 from terrafusion.fusion.cli.inspect_page import clock_table, entry, measured_texts, print_lines
 
@@ -40,7 +41,6 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
         DataError: several of a kind, and nobody to ask.
     """
     from terrafusion.datasets.checks.summary import clock, mean_rate_hz
-    from terrafusion.datasets.core.errors import DataError
     from terrafusion.datasets.readers.ros.contents import bag_contents
 
     contents = bag_contents(log, topics)
@@ -105,7 +105,6 @@ def ask(answers: Answers, topics: dict[str, str]) -> Answers:
 
 def _asked(name: str, question: str) -> Any:
     """The answer, asked for again while it is malformed; None for none."""
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.init.answers import parse
 
     while text := typer.prompt(f"  {question}", default="", show_default=False).strip():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.inspect_page import contents_lines, finding_lines
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
@@ -40,8 +41,6 @@ def inspect(
     Args:
         report (FILE.html): Also write this as a page.
     """
-    from terrafusion.fusion.cli.inspect_page import contents_lines, finding_lines
-
     page = _inspected(log, common.load_rig(vehicle), common.HowRead(topic, stamps, columns, True))
     contents = list(contents_lines(page))
     if report is not None:

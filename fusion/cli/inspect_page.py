@@ -5,6 +5,7 @@ It is made of the data that `--json` prints.
 
 import textwrap
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from typing import Any
 
 from terrafusion.datasets.core.tables import text_table
@@ -189,8 +190,6 @@ def _spread(values: dict[str, float], form: str) -> str:
 
 
 def _utc(start_ns: int) -> str:
-    from datetime import UTC, datetime
-
     if start_ns >= CENTURY_NS[0]:
         return f"start {datetime.fromtimestamp(start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     for unit, size_ns in (("s", 10**9), ("ms", 10**6), ("us", 10**3)):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.usage import refuse_options
@@ -152,7 +153,6 @@ def _domain(domain: int | None) -> int:
 
 def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     """A recording message by message, odometry after every IMU sample."""
-    from terrafusion.datasets.core.errors import DataError, errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.estimator.history import History
     from terrafusion.fusion.live.loop import live_estimator, run, verdict_of

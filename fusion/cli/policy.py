@@ -1,13 +1,16 @@
 """`terrafusion policy fit`: the weighting policy from simulated runs and labelled logs."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.command import Result, add_command
 from terrafusion.fusion.cli.outputs import Output
+from terrafusion.fusion.cli.terrain import progress
 from terrafusion.fusion.cli.usage import CommandGroup
 
 HEADS = (
@@ -44,9 +47,7 @@ def fit(
         ground (SOIL): Soil to drive on; repeat for more. By default the four of the detector.
         vehicle: Simulated vehicle of the library (elevate), and the vehicle of the logs, instead of theirs.
     """
-    import dataclasses
 
-    from terrafusion.fusion.cli.terrain import progress
     from terrafusion.fusion.training.policy_fit import LoggedSamples, default_grid, fit_policy, write_policy
     from terrafusion.fusion.training.policy_logs import read_logs
     from terrafusion.fusion.training.simulated_runs import GROUNDS
@@ -80,7 +81,6 @@ add_command(
 
 def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
     """Check that all names are of the library, whose files the hash of the policy covers."""
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.twin.model.library import known_names
 
     known = known_names(folder)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.datasets.core.errors import ConfigError, errors_of
 from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
@@ -87,7 +88,6 @@ def replay(
             drive.
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
     """
-    from terrafusion.datasets.core.errors import errors_of
     from terrafusion.fusion.grounds.file import read_grounds
     from terrafusion.fusion.replay import replay as run
     from terrafusion.fusion.reports.rerun_log import require_rerun
@@ -116,7 +116,6 @@ def replay(
 
 def _outage(text: str) -> Outage:
     """An outage; a malformed one is wrong usage (exit status 2)."""
-    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.metrics.scores import parse_outage
 
     try:

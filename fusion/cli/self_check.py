@@ -5,6 +5,8 @@ import importlib.util
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import check_folder
 from terrafusion.fusion.cli.command import Result
 
 EXTRAS = {
@@ -85,8 +87,6 @@ def _compiler() -> Check:
 
 def _caches() -> Iterator[Check]:
     from terrafusion.datasets.catalog.catalog import cache_folder
-    from terrafusion.datasets.core.errors import TerrafusionError
-    from terrafusion.datasets.core.files import check_folder
     from terrafusion.twin.engine.library_cache import wanted_folder
 
     for name, folder, remedy in (

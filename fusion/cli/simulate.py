@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -89,7 +90,6 @@ def simulate(
 
 def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
     """The run as `--json` prints it; unknown numbers are null."""
-    import dataclasses
 
     from terrafusion.datasets.core.json_text import finite
 
