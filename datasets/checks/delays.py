@@ -8,13 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.finding import (
-    CheckContext,
-    Finding,
-    clocks_of,
-    period_s,
-    retiming,
-)
+from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, period_s, retiming
 from terrafusion.datasets.checks.known_delays import (
     interval_with_sigma,
     lag_with_sigma,

@@ -7,6 +7,7 @@ to 105 s after the log's start, `LOG@/45` are all consecutive segments of 45 s.
 import dataclasses
 import itertools
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,32 +20,19 @@ LEAST_S = 5.0
 _CUT = re.compile(r"^(?P<log>.+)@(?:/(?P<every>[\d.]+)|(?P<begin>[\d.]+)-(?P<end>[\d.]+))$")
 
 
-@dataclasses.dataclass(frozen=True)
-class Cut:
-    """The selected part of a log: `begin_s` to `end_s` after its start, or segments of `every_s` seconds."""
-
-    begin_s: float | None = None
-    end_s: float | None = None
-    every_s: float | None = None
-
-    def of(self, recording: Recording) -> list[Recording]:
-        """The selected segments of a recording; a DataError where there is none."""
-        if self.every_s is not None:
-            return segments_of(recording, self.every_s)
-        assert self.begin_s is not None
-        assert self.end_s is not None
-        return [segment(recording, self.begin_s, self.end_s)]
+Cut = Callable[[Recording], list[Recording]]
+"""Gives the selected parts of a log; a DataError where there is none."""
 
 
-def split_name(text: str) -> tuple[str, Cut | None]:
-    """Split `LOG`, `LOG@60-105` or `LOG@/45` into the log and the selected part.
+def split_name(text: str) -> tuple[str, Cut]:
+    """Split `LOG`, `LOG@60-105` or `LOG@/45` into the log and what cuts it; the first is left whole.
 
     Raises:
         DataError: no number, or a segment shorter than `LEAST_S`.
     """
     found = _CUT.match(text)
     if found is None:
-        return text, None
+        return text, lambda recording: [recording]
     try:
         numbers = {k: float(v) for k, v in found.groupdict().items() if k != "log" and v is not None}
     except ValueError:
@@ -52,7 +40,9 @@ def split_name(text: str) -> tuple[str, Cut | None]:
     length_s = numbers.get("every", numbers.get("end", 0.0) - numbers.get("begin", 0.0))
     if length_s < LEAST_S:
         raise DataError(f"'{text}' is {length_s:g} s long", remedy=f"give at least {LEAST_S:g} s")
-    return found["log"], Cut(numbers.get("begin"), numbers.get("end"), numbers.get("every"))
+    if "every" in numbers:
+        return found["log"], lambda recording: segments_of(recording, length_s)
+    return found["log"], lambda recording: [segment(recording, numbers["begin"], numbers["end"])]
 
 
 def segment(recording: Recording, begin_s: float, end_s: float) -> Recording:

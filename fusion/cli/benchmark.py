@@ -53,7 +53,7 @@ def benchmark(
 
     common.check_backend(backend, address)
     plan = BenchmarkPlan(families_of(only or []), seeds, quick)
-    words = [f"--{name}" for name, given in (("quick", quick),) if given]
+    words = ["--quick"] if quick else []
     words += [f"--seeds {seeds}"] if seeds else []
     words += [f"--only {name}" for name in only or []]
     command = " ".join(["terrafusion benchmark --out DIR", *words])

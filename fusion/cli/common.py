@@ -171,7 +171,7 @@ class HowRead:
             read = open_recordings(log, **options)
             warn_of_log(log, read)
             for recording in read:
-                found += [recording] if cut is None else cut.of(recording)
+                found += cut(recording)
         return [clock_accepted(r) for r in found] if self.repair_clock else found
 
 

@@ -11,7 +11,6 @@ Both are scored like the estimate: at the same times, against the same reference
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +47,6 @@ class Baselines:
     dead_reckoning_m: float | None = None
     gnss_m: float | None = None
     outages: tuple[OutageBaseline, ...] = ()
-
-    def record(self) -> dict[str, Any]:
-        """For `metrics.json`."""
-        return dataclasses.asdict(self) | {"outages": [dataclasses.asdict(one) for one in self.outages]}
 
 
 @dataclass(frozen=True, eq=False)

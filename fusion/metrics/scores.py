@@ -28,12 +28,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Estimate
-from terrafusion.fusion.metrics.consistency import (
-    Consistency,
-    by_terrain,
-    ground_at,
-    whitened_series,
-)
+from terrafusion.fusion.metrics.consistency import Consistency, by_terrain, ground_at, whitened_series
 from terrafusion.fusion.metrics.error_series import (
     Errors,
     align_both,

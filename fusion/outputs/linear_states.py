@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,31 +18,22 @@ OBSERVED_SHARE = 0.5
 """A state counts as observed once its sigma is below this share of the prior's."""
 
 
-@dataclass(frozen=True)
-class StateQuantity:
-    """How a state of a calibration is shown: `value * scale` in `unit`."""
-
-    label: str
-    unit: str
-    scale: float
-
-
 _DEGREES = math.degrees(1.0)
 QUANTITIES = {
-    "radius_scale": StateQuantity("wheel radius, beyond the vehicle file's", "%", 100.0),
-    "antenna_x_m": StateQuantity("GNSS antenna, further forward", "m", 1.0),
-    "antenna_y_m": StateQuantity("GNSS antenna, further left", "m", 1.0),
-    "imu_roll_rad": StateQuantity("IMU turned about x", "deg", _DEGREES),
-    "imu_pitch_rad": StateQuantity("IMU turned about y", "deg", _DEGREES),
-    "imu_yaw_rad": StateQuantity("IMU turned about z", "deg", _DEGREES),
-    "wheel_delay_s": StateQuantity("wheel stamps later than the IMU's", "s", 1.0),
-    "gnss_delay_s": StateQuantity("GNSS stamps later than the IMU's", "s", 1.0),
+    "radius_scale": ("wheel radius, beyond the vehicle file's", "%", 100.0),
+    "antenna_x_m": ("GNSS antenna, further forward", "m", 1.0),
+    "antenna_y_m": ("GNSS antenna, further left", "m", 1.0),
+    "imu_roll_rad": ("IMU turned about x", "deg", _DEGREES),
+    "imu_pitch_rad": ("IMU turned about y", "deg", _DEGREES),
+    "imu_yaw_rad": ("IMU turned about z", "deg", _DEGREES),
+    "wheel_delay_s": ("wheel stamps later than the IMU's", "s", 1.0),
+    "gnss_delay_s": ("GNSS stamps later than the IMU's", "s", 1.0),
 }
-"""Of each state of `key_state.CALIBRATION`."""
+"""How each state of `key_state.CALIBRATION` is shown: label, unit, and the factor to that unit."""
 SHOWN = QUANTITIES | {
-    "turn_scale": StateQuantity("turns beyond those of the source of yaw", "%", 100.0),
-    "wheel_scale": StateQuantity("distance beyond that of the wheels", "%", 100.0),
-    "course_lag_s": StateQuantity("course behind the heading, in turns", "s", 1.0),
+    "turn_scale": ("turns beyond those of the source of yaw", "%", 100.0),
+    "wheel_scale": ("distance beyond that of the wheels", "%", 100.0),
+    "course_lag_s": ("course behind the heading, in turns", "s", 1.0),
 }
 """With the numbers of self-calibration."""
 
@@ -87,9 +77,9 @@ def learned_rows(numbers: Sequence[NumberAfterDrive]) -> list[dict[str, Any]]:
 
 def cells(row: Mapping[str, Any]) -> list[str]:
     """A row of `calibration` as text: quantity, value, sigma, prior's sigma, verdict."""
-    shown = SHOWN[row["state"]]
-    numbers = [f"{row[key] * shown.scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
+    label, unit, scale = SHOWN[row["state"]]
+    numbers = [f"{row[key] * scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
     verdict = "observed" if row["observed"] else "not observable on this drive"
     if row.get("corrects"):
         verdict = "observed, corrects the sensor"
-    return [f"{shown.label}, {shown.unit}", *numbers, verdict]
+    return [f"{label}, {unit}", *numbers, verdict]

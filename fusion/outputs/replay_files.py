@@ -74,7 +74,7 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
         "notes": [*estimate.notes, *(note for note in scores.notes if note not in estimate.notes)],
         "verdict": {"value": verdict.value, "reasons": list(verdict.reasons)},
         "assumed": [finite(dataclasses.asdict(one)) for one in result.assumed],
-        "baselines": finite(result.baselines.record()),
+        "baselines": finite(dataclasses.asdict(result.baselines)),
     }
 
 

@@ -32,11 +32,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.training.simulated_runs import seconds, wheel_samples
-from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.datasets.core.sensors import ImuSpec
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.training.simulated_runs import WheelSamples, seconds, wheel_samples
+from terrafusion.twin.model.vehicle import load_vehicle
 
 SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
 GYRO_S, ACCEL_S = 5.0, 2.0
@@ -76,33 +78,37 @@ class GroundSamples:
 
 def samples_of(recording: Recording) -> GroundSamples:
     """The samples of a simulated run on one ground."""
-    truth = recording.truth
+    truth, wheels = recording.truth, wheel_samples(recording)
     assert truth is not None
     assert truth.twist_body is not None
+    assert truth.quaternion is not None
+    vehicle = load_vehicle(recording.vehicle or "elevate")
+    R = quaternion_to_matrix(truth.quaternion)
+    grade = np.interp(wheels.t_s, seconds(truth.t_ns, recording), R[:, 2, 0])  # uphill positive
     side_slip = side_slips_of(*truth.twist_body[:, [0, 1, 5]].T)
-    slip, imu = _slip_samples(recording), _imu_samples(recording)
-    return GroundSamples(*slip, _yaw_scales(recording), side_slip, *imu, _gnss_samples(recording))
+    slip = _slip_samples(wheels, grade, vehicle.sensors.wheels.speed_sigma_mps)
+    imu = _imu_samples(recording, wheels, R, truth.twist_body, vehicle.sensors.imu)
+    gnss = _gnss_samples(recording.gnss, truth, vehicle.sensors.gnss.antenna_m)
+    return GroundSamples(*slip, _yaw_scales(wheels, vehicle.rig().track_m), side_slip, *imu, gnss)
 
 
-def _slip_samples(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:
+def _slip_samples(
+    samples: WheelSamples, grade: Array, encoder_mps: float
+) -> tuple[Array, Array, Array, Array, Array]:
     """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s not explained by slip."""
-    samples = wheel_samples(recording)
     wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
     step = float(np.median(np.diff(samples.t_s)))
     short = max(round(SHORT_S / step), 1)
-    wheel, forward = _block_means(wheel, short), _block_means(forward, short)
-    grade = _block_means(_grades(recording, samples.t_s), short)
+    wheel, forward, grade = (_block_means(x, short) for x in (wheel, forward, grade))
     width = round(1.0 / SHORT_S)
     kernel = np.full(width, 1.0 / width)
     smooth_wheel, smooth = np.convolve(wheel, kernel, "same"), np.convolve(forward, kernel, "same")
     turning = np.abs(smooth_wheel) > TURNING_MPS
     share = np.divide(smooth, smooth_wheel, out=np.ones_like(smooth), where=turning)
     residual = (forward - share * wheel)[turning]
-
     blocks = round(SLIP_S / SHORT_S)
     slips = slips_of(*(_block_means(x, blocks) for x in (wheel, forward, grade)))
-    encoder = _vehicle(recording).sensors.wheels.speed_sigma_mps
-    return *slips, np.hypot(residual, encoder)
+    return *slips, np.hypot(residual, encoder_mps)
 
 
 def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array, Array, Array, Array]:
@@ -122,15 +128,6 @@ def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array,
     return slip[counted], grade[counted], pairs[both], grade_pairs[both]
 
 
-def _grades(recording: Recording, t_s: Array) -> Array:
-    """Sine of the true pitch (n,), uphill positive."""
-    truth = recording.truth
-    assert truth is not None
-    assert truth.quaternion is not None
-    up = quaternion_to_matrix(truth.quaternion)[:, 2, 0]
-    return np.interp(t_s, seconds(truth.t_ns, recording), up)
-
-
 def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
     """Time (n,), s, since the robot got stuck, at each half second; 0 if it is not stuck."""
     age, out = 0.0, np.zeros(len(stuck))
@@ -140,12 +137,10 @@ def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
     return out
 
 
-def _yaw_scales(recording: Recording) -> Array:
-    samples = wheel_samples(recording)
+def _yaw_scales(samples: WheelSamples, track_m: float) -> Array:
     count = max(round(SLIP_S / float(np.median(np.diff(samples.t_s)))), 1)
     left, right = _block_means(samples.sides_mps, count).T
-    wheel = (right - left) / _vehicle(recording).rig().track_m
-    return yaw_scales_of(wheel, _block_means(samples.yaw_rate_radps, count))
+    return yaw_scales_of((right - left) / track_m, _block_means(samples.yaw_rate_radps, count))
 
 
 def yaw_scales_of(wheel_radps: Array, true_radps: Array) -> Array:
@@ -163,28 +158,26 @@ def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> 
     return np.asarray((lateral_mps + icr * rate_radps)[moving] / forward_mps[moving])
 
 
-def _imu_samples(recording: Recording) -> tuple[Array, Array, Array]:
+def _imu_samples(
+    recording: Recording, samples: WheelSamples, R: Array, twist: Array, spec: ImuSpec
+) -> tuple[Array, Array, Array]:
     """Errors of means over the data sheet's: gyro about roll and pitch (2 n,), yaw (n,), accelerometer (m,).
 
-    A sample is compared with the rotation and change of velocity over the interval that it ends.
+    A sample is compared with the rotation and change of velocity over the interval that it ends, by true
+    rotations (k, 3, 3) and body twists (k, 6).
     """
     imu, truth = recording.imu, recording.truth
     assert imu is not None
     assert truth is not None
-    assert truth.twist_body is not None
-    assert truth.quaternion is not None
-    spec = _vehicle(recording).sensors.imu
     imu_t, truth_t = seconds(imu.t_ns, recording), seconds(truth.t_ns, recording)
     step = float(np.median(np.diff(imu_t)))
     rows = np.searchsorted(truth_t, np.append(imu_t[0] - step, imu_t) - 0.5 * step)
     rows = np.minimum(rows, len(truth_t) - 1)
-    R = quaternion_to_matrix(truth.quaternion[rows])
-    twist = truth.twist_body[rows]
+    R, twist = R[rows], twist[rows]
     velocity = np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m))  # the IMU's
     change = np.diff(velocity, axis=0) / step + np.array([0.0, 0.0, GRAVITY_MPS2])
     gyro = imu.gyro_radps - _rotation_vectors(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / step
     accel = imu.accel_mps2 - np.einsum("nji,nj->ni", R[:-1], change)
-    samples = wheel_samples(recording)
     speed = np.interp(imu_t, samples.t_s, np.abs(samples.sides_mps).mean(axis=1))
     return (
         _relative(gyro[:, :2], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
@@ -216,18 +209,12 @@ def _unbiased(error: Array, tau_s: float) -> Array:
     return np.asarray(error - slow)
 
 
-def _gnss_samples(recording: Recording) -> Array:
+def _gnss_samples(gnss: Gnss | None, truth: Trajectory, antenna_m: tuple[float, ...]) -> Array:
     """Horizontal errors of the fixes over their reported sigma, east and north together (n,)."""
-    gnss, truth = recording.gnss, recording.truth
-    if gnss is None or truth is None:
+    if gnss is None:
         return np.empty(0)
-    antenna = _vehicle(recording).sensors.gnss.antenna_m
-    error = (gnss.enu_m - truth.points_at(gnss.t_ns, antenna))[:, :2] / gnss.sigma_enu_m[:, :2]
+    error = (gnss.enu_m - truth.points_at(gnss.t_ns, antenna_m))[:, :2] / gnss.sigma_enu_m[:, :2]
     return np.asarray(error[(gnss.fix > Fix.NONE) & np.isfinite(error).all(axis=1)].ravel())
-
-
-def _vehicle(recording: Recording) -> VehicleParams:
-    return load_vehicle(recording.vehicle or "elevate")
 
 
 def _block_means(x: Array, count: int) -> Array:

@@ -19,12 +19,7 @@ from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import (
-    COLUMNS,
-    ChannelReader,
-    Layouts,
-    wheel_columns,
-)
+from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, Layouts, wheel_columns
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros import topics

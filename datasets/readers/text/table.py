@@ -17,12 +17,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.channel_tables import (
-    GNSS_SIGMA,
-    GNSS_VELOCITY,
-    QUATERNION,
-    ChannelReader,
-)
+from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of

@@ -38,16 +38,17 @@ def test_a_segment_has_the_ground_label_at_its_start(drive: Recording) -> None:
     assert late.terrain.t_ns[0] == late.start_ns
 
 
-def test_names_of_segments() -> None:
-    assert split_name("set/log") == ("set/log", None)
-    assert split_name("me@home/log")[1] is None
-    name, cut = split_name("set/log@60-105")
-    assert name == "set/log"
-    assert cut is not None
-    assert (cut.begin_s, cut.end_s) == (60.0, 105.0)
-    every = split_name("set/log@/45")[1]
-    assert every is not None
-    assert every.every_s == 45.0
+def test_names_of_segments(drive: Recording) -> None:
+    def cut(text: str) -> tuple[str, list[str]]:
+        log, parts = split_name(text)
+        return log, [part.name for part in parts(drive)]
+
+    assert cut("set/log") == ("set/log", ["drive"])
+    assert cut("me@home/log") == ("me@home/log", ["drive"])
+    assert cut("set/log@20-45") == ("set/log", ["drive@20-45"])
+    log, parts = cut("set/log@/20")
+    assert (log, len(parts)) == ("set/log", 3)
+    assert all(part.startswith("drive@") for part in parts)
 
 
 @pytest.mark.parametrize("text", ["log@60-61", "log@60-50", "log@/2", "log@1.2.3-9"])
