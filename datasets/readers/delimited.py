@@ -7,6 +7,7 @@ lines and cuts long ones silently.
 import csv
 import gzip
 import io
+import math
 import os
 import re
 import zlib
@@ -360,7 +361,7 @@ def _check_cells(data: bytes, layout: TextLayout, numbers: set[str]) -> None:
     for line, cells in _rows(data, layout):
         for name, cell in zip(layout.names, cells, strict=False):
             missing = not cell if layout.strict else cell.strip() in MISSING
-            if name in numbers and not missing and not _is_finite(cell):
+            if name in numbers and not missing and number_in(cell) is None:
                 raise _line_error(data, layout, _cell_is(name, cell, line), cells, remedy)
 
 
@@ -392,11 +393,13 @@ def not_a_table(line: int, error: csv.Error) -> DataError:
     return DataError(what, remedy="write plain separated numbers, without quotes")
 
 
-def _is_finite(cell: str) -> bool:
+def number_in(cell: str) -> float | None:
+    """The finite number that a text is; None where it is none."""
     try:
-        return bool(np.isfinite(float(cell))) and "_" not in cell
+        number = float(cell)
     except ValueError:
-        return False
+        return None
+    return number if math.isfinite(number) and "_" not in cell else None
 
 
 def _cell_is(name: str, cell: str, line: int) -> str:

@@ -19,6 +19,7 @@ from terrafusion.datasets.readers.delimited import (
     TextLayout,
     TextTable,
     head_lines,
+    number_in,
     read_columns,
     read_text,
     split,
@@ -118,10 +119,7 @@ def _header(data: bytes, columns: Sequence[str], separator: str) -> tuple[str, .
 def are_numbers(head: bytes) -> bool:
     """Whether the first line of a file is numbers between blanks."""
     cells = next((line.split() for _, line in head_lines(head, 1)), [])
-    try:
-        return bool(np.isfinite([float(cell) for cell in cells]).all()) and bool(cells)
-    except ValueError:
-        return False
+    return bool(cells) and all(number_in(cell) is not None for cell in cells)
 
 
 def in_time(

@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from terrafusion.datasets.readers.delimited import number_in
 from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, units_of
 
 TICKS = "1/1024"
@@ -158,11 +159,10 @@ def _in_g(headers: Sequence[_Header], cells: Mapping[str, str]) -> bool:
         guess = _guess(header)
         if guess is None or not guess[1].startswith("accel_") or header.unit or header.column == guess[1]:
             continue
-        try:
-            square += float(cells.get(header.column, "").replace(",", ".")) ** 2
-        except ValueError:
+        value = number_in(cells.get(header.column, "").replace(",", "."))
+        if value is None:
             return False
-        axes += 1
+        square, axes = square + value**2, axes + 1
     return axes == 3 and _IN_G[0] ** 2 < square < _IN_G[1] ** 2
 
 
@@ -245,14 +245,13 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
 def _time_entry(time: _Header, cell: str) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
-    try:
-        value = abs(float(cell.replace(",", ".")))
-    except ValueError:
-        if cell.strip():
-            return f"{{column: {name}, unit: iso8601}}"
+    value = number_in(cell.replace(",", "."))
+    if value is None and cell.strip():
+        return f"{{column: {name}, unit: iso8601}}"
+    if value is None:
         return f"{{column: {name}, unit: {unit or 's'}, epoch: unix}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
-    unit = unit or next((known for known in ("ns", "us", "ms") if value >= size[known]), "s")
-    if value < 0.1 * size[unit]:
+    unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "s")
+    if abs(value) < 0.1 * size[unit]:
         epoch = "none"
     return f"{{column: {name}, unit: {unit}, epoch: {epoch}}}"

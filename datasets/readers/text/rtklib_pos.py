@@ -23,6 +23,7 @@ from terrafusion.datasets.readers.delimited import (
     TextLayout,
     TextTable,
     head_lines,
+    number_in,
     read_columns,
     read_text,
     split,
@@ -53,7 +54,7 @@ class PosHeader:
     kind: str
     separator: str
     time_system: str
-    base: tuple[float, ...] | None
+    base: tuple[float | None, ...]
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -85,7 +86,7 @@ def _is_row(head: bytes) -> bool:
 
 
 def _header(data: bytes) -> PosHeader:
-    base: tuple[float, ...] | None = None
+    base: tuple[float | None, ...] = ()
     found: PosHeader | None = None
     for number, line in head_lines(data):
         if not line.startswith("%"):
@@ -93,7 +94,7 @@ def _header(data: bytes) -> PosHeader:
                 break
             continue
         if "ref pos" in line:
-            base = _numbers(line.partition(":")[2])
+            base = tuple(map(number_in, line.partition(":")[2].replace(",", " ").split()))
         kind = next((kind for kind in POSITIONS if kind in line), None)
         if kind is None:
             continue
@@ -111,13 +112,6 @@ def _header(data: bytes) -> PosHeader:
             f"unknown time system '{found.time_system[:20]}'", remedy=f"known are {', '.join(TIME_SYSTEMS)}"
         )
     return found
-
-
-def _numbers(text: str) -> tuple[float, ...] | None:
-    try:
-        return tuple(float(word) for word in text.replace(",", " ").split())
-    except ValueError:
-        return None
 
 
 def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
@@ -187,8 +181,8 @@ def _fix(columns: TextTable, notes: list[str]) -> NDArray[np.uint8]:
 
 def _base(header: PosHeader, notes: list[str]) -> Datum | None:
     """Position of the base station of a baseline, where the file has it."""
-    base = header.base
-    if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
+    base = [number for number in header.base if number is not None]
+    if len(base) == len(header.base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
         return base[0], base[1], base[2]
     notes.append("gnss: baselines of a base station whose position is not in the file")
     return None

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
-from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
+from terrafusion.datasets.readers.delimited import head_lines, number_in, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
@@ -178,8 +178,9 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     if name != "fix" or not of.unit:
         return texts
     words, inverse = distinct(texts)
-    codes = {code: fix.name.lower() for code, fix in FIX_OF_CODE[of.unit].items()}
-    meanings = [codes.get(_whole(word), "") for word in words]
+    codes: dict[float, str] = {code: fix.name.lower() for code, fix in FIX_OF_CODE[of.unit].items()}
+    numbers = map(number_in, words)
+    meanings = ["" if number is None else codes.get(number, "") for number in numbers]
     for word, meant in zip(words, meanings, strict=True):
         if word.strip() and not meant:
             raise DataError(
@@ -187,15 +188,6 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
                 remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
             )
     return np.array(meanings, dtype=object)[inverse]
-
-
-def _whole(word: str) -> int:
-    """A whole number as text, -99 where it is none: no receiver has that code."""
-    try:
-        number = float(word)
-    except ValueError:
-        return -99
-    return int(number) if number.is_integer() else -99
 
 
 class _Reader(ChannelReader):

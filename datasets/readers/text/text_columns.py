@@ -13,8 +13,10 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
+    MISSING,
     TextLayout,
     head_lines,
+    number_in,
     read_columns,
     read_text,
     separator_of,
@@ -85,7 +87,7 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     first_line = number + 1
     if column_map is not None and column_map.header == "none":
         cells, first_line = [str(i) for i in range(1, len(cells) + 1)], number
-    elif comment and len(split(comment, separator)) == len(cells) and _is_row(cells):
+    elif comment and len(split(comment, separator)) == len(cells) and all(map(_is_value, cells)):
         cells, first_line = split(comment, separator), number
     limits.check_columns(len(cells))
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
@@ -111,12 +113,8 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
 
 
-def _is_row(cells: list[str]) -> bool:
-    try:
-        [float(cell) for cell in cells if cell]
-    except ValueError:
-        return False
-    return True
+def _is_value(cell: str) -> bool:
+    return cell in MISSING or number_in(cell) is not None
 
 
 class ParquetColumns:
