@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
@@ -23,6 +22,7 @@ SETTLING_S = 3.0
 """Driving after a change of ground in which a switch of the detector does not count as false."""
 MIN_SCORED_PATCH_S = 5.0
 IN_TIME_S = 2.0
+ECE_BINS = 10
 Run = TypeVar("Run")
 
 
@@ -36,12 +36,18 @@ class LabelledRoute:
 
 
 @dataclass(frozen=True)
-class DetectorScores(ClassificationScores):
+class DetectorScores:
     """Scores of a detector over routes; only windows in which the robot or its wheels moved count.
 
     `unknown`, the last class, is right if no other one is.
 
     Attributes:
+        classes: k names.
+        macro_f1: mean F1 of the classes that occurred.
+        accuracy: share of windows with the right class.
+        ece: expected calibration error (Naeini et al. 2015) of the most probable class.
+        confusion: (k, k) shares; a row is a true class and sums to one, or to zero if it did not occur.
+        windows: their number.
         unknown_share: share of windows classified as unknown.
         switch_delay_s: median, 95th percentile and largest time from a change of ground to its detection.
         switches_in_time: share of patches (of `MIN_SCORED_PATCH_S` and more) whose ground was detected within
@@ -51,6 +57,12 @@ class DetectorScores(ClassificationScores):
         update_ms: mean processor time of one update.
     """
 
+    classes: tuple[str, ...]
+    macro_f1: float
+    accuracy: float
+    ece: float
+    confusion: tuple[tuple[float, ...], ...]
+    windows: int
     unknown_share: float
     switch_delay_s: tuple[float, float, float]
     switches_in_time: float
@@ -117,17 +129,27 @@ def evaluate(trials: Sequence[tuple[TerrainModel, LabelledRoute]]) -> DetectorSc
         delays += delays_here
         missed += missed_here
         false += false_here
-    winner = np.concatenate(winners)
-    scores = classification_scores(classes, np.concatenate(truths), winner, np.concatenate(confidences))
+    winner, true, confidence = map(np.concatenate, (winners, truths, confidences))
+    k, right = len(classes), winner == true
+    counts = np.bincount(true * k + winner, minlength=k * k).reshape(k, k)
+    of_class = counts.sum(axis=1)
+    f1 = 2.0 * np.diag(counts) / np.maximum(of_class + counts.sum(axis=0), 1)
+    bins = np.minimum((confidence * ECE_BINS).astype(int), ECE_BINS - 1)
+    gap = np.bincount(bins, weights=confidence - right, minlength=ECE_BINS)
     quantiles = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
     in_time, changes = sum(delay <= IN_TIME_S for delay in delays), len(delays) + missed
     return DetectorScores(
-        **vars(scores),
-        unknown_share=float((winner == len(classes) - 1).mean()),
+        classes=classes,
+        macro_f1=float(f1[of_class > 0].mean()),
+        accuracy=float(right.mean()),
+        ece=float(np.abs(gap).sum() / len(winner)),
+        confusion=tuple(map(tuple, (counts / np.maximum(of_class, 1)[:, None]).tolist())),
+        windows=len(winner),
+        unknown_share=float((winner == k - 1).mean()),
         switch_delay_s=(float(quantiles[0]), float(quantiles[1]), float(quantiles[2])),
         switches_in_time=in_time / changes if changes else float("nan"),
         switches_missed=missed / max(changes, 1),
-        false_switches_per_min=false / max(scores.windows * UPDATE_S / 60.0, 1e-9),
+        false_switches_per_min=false / max(len(winner) * UPDATE_S / 60.0, 1e-9),
         update_ms=1e3 * seconds / max(updates, 1.0),
     )
 
