@@ -113,25 +113,24 @@ def first_vehicle(
     measured, geometry = _geometry(recording, answers, base, rig)
     with scratch_folder() as folder, _errors_of_log(folder, first.name):
         file = folder / "vehicle.yaml"
-        mounted = _mounted(open_log, head | geometry | tail, file)
-        if mounted.axes or mounted.repaired:  # what is measured about z holds only now
-            tail = mounted.axes | tail
-            measured, geometry = _geometry(mounted.recording, answers, base, rig)
-        tilted, tilt_notes = tilt_lines(measure_tilt(mounted.recording, base), mounted.recording.name)
+        recording, axes, repaired, findings = _mounted(open_log, head | geometry | tail, file)
+        if axes or repaired:  # what is measured about z holds only now
+            tail = axes | tail
+            measured, geometry = _geometry(recording, answers, base, rig)
+        tilted, tilt_notes = tilt_lines(measure_tilt(recording, base), recording.name)
         draft = head | geometry | tail | tilted
-        forward = forward_line(mounted.recording, load_vehicle(write_draft(file, draft, "draft")).rig())
+        forward = forward_line(recording, load_vehicle(write_draft(file, draft, "draft")).rig())
         start = write_draft(file, draft | forward, "draft")
-        calibration, notes = _calibrated(mounted.recording, start, progress)
-        findings = mounted.findings
+        calibration, notes = _calibrated(recording, start, progress)
         if calibration is not None:
-            draft |= forward | _learned_lines(calibration, draft, mounted.recording.imu is not None)
+            draft |= forward | _learned_lines(calibration, draft, recording.imu is not None)
             learned = load_vehicle(write_draft(file, draft, "draft")).rig()
-            findings = tuple(run_checks(mounted.recording, learned))
+            findings = run_checks(recording, learned)
     if extended != "generic":
         known = f"the log names its vehicle '{base.name}': --vehicle {extended} needs no new file"
         notes = (known, *notes)
     notes = (*tilt_notes, *notes)
-    return FirstVehicle(draft, mounted.recording, mounted.repaired, findings, measured, calibration, notes)
+    return FirstVehicle(draft, recording, tuple(repaired), tuple(findings), measured, calibration, notes)
 
 
 @contextmanager
@@ -181,18 +180,11 @@ def _with_geometry(rig: Rig, answers: Answers) -> Rig:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Mounted:
-    """The log with its IMU in body axes: by the line `axes` of the file, or `repaired`."""
-
-    recording: Recording
-    axes: Draft
-    repaired: tuple[Finding, ...]
-    findings: tuple[Finding, ...]
-
-
-def _mounted(open_log: Open, draft: Draft, file: Path) -> _Mounted:
-    """The log read with the draft and, where that helps, the axes of its IMU; else repaired.
+def _mounted(
+    open_log: Open, draft: Draft, file: Path
+) -> tuple[Recording, Draft, list[Finding], list[Finding]]:
+    """The log with its IMU in body axes: by the lines of the file given beside it, else by the repairs beside
+    those; and what the checks still find.
 
     Raises:
         DataError: it has an error that no repair removes.
@@ -221,7 +213,7 @@ def _mounted(open_log: Open, draft: Draft, file: Path) -> _Mounted:
                 channel=finding.channel,
                 remedy=f"{finding.fix}; then run this again",
             )
-    return _Mounted(recording, axes, tuple(repaired), tuple(findings))
+    return recording, axes, repaired, findings
 
 
 def _read(open_log: Open, draft: Draft, file: Path) -> tuple[Recording, Rig]:

@@ -12,7 +12,7 @@ CSV. The same estimate gives the same bytes.
 import csv
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers.log_folder import decimal_seconds
 from terrafusion.datasets.writers.tum import write_tum
-from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
+from terrafusion.fusion.estimate.estimate import STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.metrics.scores import Scores
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
@@ -134,12 +134,17 @@ def write_outputs(
     Raises:
         TerrafusionError: the folder cannot be made or written.
     """
-    changes = [change_record(change, recording.start_ns) for change in estimate.changes]
+    changes = (
+        {"t_s": (change.t_ns - recording.start_ns) * 1e-9} | dataclasses.asdict(change)
+        for change in estimate.changes
+    )
     writers: dict[str, Callable[[Path], object]] = {
         "metrics.json": lambda path: path.write_text(to_json(metrics, indent=2) + "\n", encoding="utf-8"),
         "estimate.csv": lambda path: _write_csv(path, estimate_columns(estimate, recording.start_ns)),
         "trajectory.tum": lambda path: write_tum(estimate.trajectory, path),
-        "weights.jsonl": lambda path: _write_lines(path, map(to_json, changes)),
+        "weights.jsonl": lambda path: path.write_text(
+            "".join(to_json(change) + "\n" for change in changes), encoding="utf-8", newline="\n"
+        ),
     }
     return {name: write_atomically(directory / name, write) for name, write in writers.items()}
 
@@ -200,11 +205,6 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     return table
 
 
-def change_record(change: WeightChange, start_ns: int) -> dict[str, Any]:
-    """One line of `weights.jsonl`: t_s, t_ns, sensor, before, after, unit, reason."""
-    return {"t_s": (change.t_ns - start_ns) * 1e-9} | dataclasses.asdict(change)
-
-
 def _numbers(names: Sequence[str], values: NDArray[Any], spec: str) -> dict[str, list[str]]:
     columns = np.asarray(values, dtype=float).T.tolist()
     return {
@@ -222,11 +222,6 @@ def _write_csv(path: Path, table: Mapping[str, list[str]]) -> None:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(_one_line(name) for name in table)
         writer.writerows(zip(*table.values(), strict=True))
-
-
-def _write_lines(path: Path, lines: Iterable[str]) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as out:
-        out.writelines(line + "\n" for line in lines)
 
 
 def _at_least_zero(value: float) -> float:
