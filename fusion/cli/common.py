@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -289,15 +290,8 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
         yield lambda share: bar.update(task, completed=share)
 
 
-@dataclass
-class ProgressOptions:
-    """Whether progress is shown: as a bar on a terminal, as lines in a pipe."""
-
-    bar: bool = True
-    lines: bool = False
-
-
-PROGRESS = ProgressOptions()
+PROGRESS = SimpleNamespace(bar=True, lines=False)
+"""Whether progress is shown: as a bar on a terminal, as lines in a pipe."""
 LINE_EVERY_S = 5.0
 
 
