@@ -26,6 +26,7 @@ FEATURES = ("z_low", "z_mid", "z_high", "xy", "roll_pitch", "slip", "yaw_slip")
 
 SLIP = FEATURES.index("slip")
 YAW_SLIP = FEATURES.index("yaw_slip")
+BANDS_HZ = ((1.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 14.0), (14.0, 20.0), (20.0, 30.0), (30.0, 45.0))
 LOW_HZ, MID_HZ, HIGH_HZ = (3.0, 8.0), (8.0, 14.0), (14.0, 45.0)
 MIN_SPEED_MPS = 0.15
 """Below this the ground is unobservable: no vibration, and slip is a quotient of two noises."""
@@ -34,6 +35,7 @@ _MIN_YAW_RATE_RADPS = 0.15
 _MIN_SPAN_S = 0.6
 _ACCEL_FLOOR_MPS2 = 1e-3
 _GYRO_FLOOR_RADPS = 1e-4
+_LEAST_POWER = 1e-7
 _TIMING_S = 0.05
 _LEAST_INFORMATION = 1.0
 """Of the measurements, in units of the prior's, for the slip to count as observed."""
@@ -73,6 +75,17 @@ class Window:
         known = [abs(v) for v in (self.speed_mps, self.wheel_speed_mps) if not math.isnan(v)]
         return float(max(known, default=0.0))
 
+    @functools.cached_property
+    def vibration(self) -> Array:
+        """Its `vibration_levels` (5,)."""
+        return vibration_levels(self.imu_t_s, self.accel_mps2, self.gyro_radps)
+
+    @functools.cached_property
+    def bands(self) -> Array:
+        """Its `band_levels` (42,) at 1 m/s."""
+        levels = band_levels(self.imu_t_s, np.hstack([self.gyro_radps, self.accel_mps2]))
+        return np.asarray(levels - 0.5 * np.log10(self.ground_speed_mps()))
+
 
 def extract(window: Window, vibration: bool = True) -> tuple[Array, Array]:
     """Features (7,) in the order of `FEATURES`, and the measurement variance (7,) of each.
@@ -85,8 +98,7 @@ def extract(window: Window, vibration: bool = True) -> tuple[Array, Array]:
     if not window.ground_speed_mps() > MIN_SPEED_MPS:
         return values, variances
     if vibration:
-        values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
-        values[:SLIP] -= 0.5 * np.log10(window.ground_speed_mps())
+        values[:SLIP] = window.vibration - 0.5 * np.log10(window.ground_speed_mps())
     wheel = window.wheel_speed_mps
     if window.slip is not None and window.slip_sigma is not None and abs(wheel) > MIN_SPEED_MPS:
         values[SLIP] = np.clip(window.slip, *_SLIP_RANGE)
@@ -149,6 +161,26 @@ def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
     floors = np.array([_ACCEL_FLOOR_MPS2] * 4 + [_GYRO_FLOOR_RADPS])
     powers[powers == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
     return np.asarray(0.5 * np.log10(powers + floors**2))
+
+
+def band_levels(t_s: Array, samples: Array) -> Array:
+    """log10 band RMS (42,): by band, of the columns of samples (n, 6), gyro (rad/s) and accelerometer (m/s2).
+
+    NaN where the IMU is too slow for a band or lacks an axis; all of it where samples are missing.
+    """
+    levels = np.full((len(BANDS_HZ), 6), np.nan)
+    rate = sample_rate_hz(t_s)
+    if rate is None:
+        return levels.ravel()
+    density = periodogram(samples, rate)
+    frequency = np.arange(len(density)) * rate / len(t_s)
+    for level, (low, high) in zip(levels, BANDS_HZ, strict=True):
+        rows = slice(*np.searchsorted(frequency, (low, high)))
+        if rate >= 2.1 * high and rows.stop > rows.start:
+            power = density[rows].mean(axis=0) * (high - low)
+            power[power == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
+            level[:] = 0.5 * np.log10(power + _LEAST_POWER)
+    return levels.ravel()
 
 
 def sample_rate_hz(t_s: Array) -> float | None:

@@ -13,35 +13,13 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.quantity import Quantity
-from terrafusion.fusion.terrain.features import Window, periodogram, sample_rate_hz
+from terrafusion.fusion.terrain.features import BANDS_HZ, Window
 
-BANDS_HZ = ((1.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 14.0), (14.0, 20.0), (20.0, 30.0), (30.0, 45.0))
 LEVELS = 6 * len(BANDS_HZ)
 FLOOR = 1e-3
 """Least probability of a ground, so that no single window excludes it."""
-_LEAST_POWER = 1e-7
 
 _Levels = Annotated[tuple[float, ...], Quantity("", size=LEVELS)]
-
-
-def band_levels(window: Window) -> Array:
-    """log10 band RMS at 1 m/s (42,): by band, of gyro x, y, z in rad/s, then accelerometer x, y, z in m/s2.
-
-    NaN where the IMU is too slow for a band or lacks an axis; all of it where samples are missing.
-    """
-    levels = np.full((len(BANDS_HZ), 6), np.nan)
-    rate = sample_rate_hz(window.imu_t_s)
-    if rate is None:
-        return levels.ravel()
-    density = periodogram(np.hstack([window.gyro_radps, window.accel_mps2]), rate)
-    frequency = np.arange(len(density)) * rate / len(window.imu_t_s)
-    for level, (low, high) in zip(levels, BANDS_HZ, strict=True):
-        rows = slice(*np.searchsorted(frequency, (low, high)))
-        if rate >= 2.1 * high and rows.stop > rows.start:
-            power = density[rows].mean(axis=0) * (high - low)
-            power[power == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
-            level[:] = 0.5 * np.log10(power + _LEAST_POWER)
-    return np.asarray(levels.ravel() - 0.5 * np.log10(window.ground_speed_mps()))
 
 
 @dataclass(frozen=True)
@@ -97,7 +75,7 @@ class SpectrumClassifier:
 
     def log_odds(self, window: Window) -> Array | None:
         """Log-odds (k,) of the grounds against their geometric mean; None where no level is known."""
-        levels = band_levels(window)
+        levels = window.bands
         if not np.isfinite(levels).any():
             return None
         logits = self.weights @ self.standardised(levels) + self.offsets

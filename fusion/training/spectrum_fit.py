@@ -20,7 +20,7 @@ _SHRINK = 1e-3
 def fit_spectrum(levels: Mapping[str, Array]) -> SpectrumClassifier | None:
     """The classifier, every ground as likely as another; None where the grounds have no level in common.
 
-    `levels` are (n, 42) of `band_levels` by ground; a level that not every ground shows is not used.
+    `levels` are (n, 42) of `Window.bands` by ground; a level that not every ground shows is not used.
     """
     from sklearn.linear_model import LogisticRegression
 

@@ -15,7 +15,6 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
-from terrafusion.fusion.terrain.spectrum import band_levels
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.logged_runs import LoggedRun
 from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectrum
@@ -148,7 +147,7 @@ def _fitted(runs: Sequence[LoggedRun]) -> TerrainModel:
     spectra: dict[str, list[Array]] = {}
     for windows, ground in (piece for run in runs for piece in pieces(run)):
         rows.setdefault(ground, []).append(features_of(windows))
-        spectra.setdefault(ground, []).extend(band_levels(window) for window in windows)
+        spectra.setdefault(ground, []).extend(window.bands for window in windows)
     x = {ground: np.vstack(parts) for ground, parts in sorted(rows.items())}
     everywhere = np.all([np.isfinite(one).any(axis=0) for one in x.values()], axis=0)
     model = draft({ground: np.where(everywhere, one, np.nan) for ground, one in x.items()}, runs[0].vehicle)

@@ -16,8 +16,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.terrain.change_alarm import ChangeAlarm
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector
-from terrafusion.fusion.terrain.features import Window
-from terrafusion.fusion.terrain.spectrum import BANDS_HZ, FLOOR, LEVELS, band_levels, log_probabilities
+from terrafusion.fusion.terrain.features import BANDS_HZ, Window
+from terrafusion.fusion.terrain.spectrum import FLOOR, LEVELS, log_probabilities
 from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectrum
 from terrafusion.fusion.training.train_detector import draft, features_of, write_model
 
@@ -44,28 +44,28 @@ def tones(axis: int, hz: float, count: int = 120) -> list[Window]:
 @pytest.mark.parametrize("band", range(1, len(BANDS_HZ)))
 def test_a_tone_raises_the_level_of_its_axis_and_band(axis: int, band: int) -> None:
     hz = float(np.mean(BANDS_HZ[band]))
-    raised = band_levels(window(1, tone=(axis, hz))) - band_levels(window(1))
+    raised = window(1, tone=(axis, hz)).bands - window(1).bands
     assert int(np.argmax(raised)) == 6 * band + axis
 
 
 def test_levels_are_those_at_1_mps() -> None:
-    slow, fast = (band_levels(window(2, speed_mps=v, wheel_speed_mps=v)) for v in (0.5, 2.0))
+    slow, fast = (window(2, speed_mps=v, wheel_speed_mps=v).bands for v in (0.5, 2.0))
     assert slow - fast == pytest.approx(np.full(LEVELS, 0.5 * np.log10(4.0)))
 
 
 def test_bands_above_a_slow_imu_and_missing_samples_are_unknown() -> None:
-    slow = band_levels(window(3, rate_hz=30.0)).reshape(len(BANDS_HZ), 6)
+    slow = window(3, rate_hz=30.0).bands.reshape(len(BANDS_HZ), 6)
     assert np.isfinite(slow).all(axis=1).tolist() == [2.1 * high <= 30.0 for _, high in BANDS_HZ]
     gap = window(3)
     gap.imu_t_s[50:] += 1.0
-    assert np.isnan(band_levels(gap)).all()
+    assert np.isnan(gap.bands).all()
 
 
 @pytest.fixture(scope="module")
 def model() -> TerrainModel:
     """Of two grounds that shake as strongly, one in roll, one along x: the shipped features add x to y."""
     made = {"cobbles": tones(3, 8.0), "track": tones(4, 8.0)}
-    levels = {ground: np.array([band_levels(w) for w in windows]) for ground, windows in made.items()}
+    levels = {ground: np.array([w.bands for w in windows]) for ground, windows in made.items()}
     fitted = draft({ground: features_of(windows) for ground, windows in made.items()}, "husky")
     return TerrainModel(
         fitted.classes, fitted.unknown, 2.0, 25.0, fitted.vehicles, spectrum=fit_spectrum(levels)
@@ -133,7 +133,7 @@ def test_the_alarm_is_raised_at_a_change_and_once() -> None:
 def test_false_alarms_come_as_often_as_trained() -> None:
     rng = np.random.default_rng(1)
     runs = [[window(int(s)) for s in rng.integers(0, 1 << 30, 80)] for _ in range(12)]
-    levels = np.array([band_levels(w) for run in runs for w in run])
+    levels = np.array([w.bands for run in runs for w in run])
     classifier = fit_spectrum({"even": levels[::2], "odd": levels[1::2]})
     assert classifier is not None
     precision = alarm_precision(classifier, runs[:9])
