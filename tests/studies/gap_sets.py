@@ -209,16 +209,14 @@ def stored(found: Explanation, candidates: Candidates) -> dict[str, Any]:
             sizes[candidates.keys[column]] = (float(fit.values[0][0]) * scale, sigma * scale)
     evidence = {"+".join(k): v for k, v in found.evidence.items() if math.isfinite(v)}
     alike = {effect: sorted(some) for effect, some in found.alike.items()}
-    left = {"+".join(k): v for k, v in found.left.items()}
-    return {"evidence": evidence, "outside": found.outside, "sizes": sizes, "alike": alike, "left": left}
+    return {"evidence": evidence, "outside": found.outside, "sizes": sizes, "alike": alike}
 
 
 def restored(found: Mapping[str, Any]) -> Explanation:
     """The explanation without its fits."""
     evidence = {tuple(k.split("+")): v for k, v in found["evidence"].items()}
     alike = {effect: {*some} for effect, some in found["alike"].items()}
-    left = {tuple(k.split("+")): v for k, v in found.get("left", {}).items()}
-    return Explanation(evidence, {}, found["outside"], alike, lambda fit: [], left)
+    return Explanation(evidence, {}, found["outside"], alike, lambda fit: [])
 
 
 def p_value(one: Mapping[str, Any]) -> float:

@@ -19,6 +19,7 @@ from terrafusion.twin.sensors.effects import DELAYS
 UNKNOWN = 0.5  # probability of an unknown cause, given a gap, above which that is the verdict
 CREDIBLE, LEAST_MEMBER = 0.95, 0.02
 """Probability of a credible set, and the least (assumed) of a member, given the effects beside it."""
+MOST_LEFT = 0.5  # share of the gap that named effects may leave on drives unlike the references' (assumed)
 FINEST_P = {False: 1e-4, True: 1e-3}
 """Least p-value that counts as evidence of an unknown cause: below, it is extrapolated (assumed).
 Keys: whether drives are unlike the references'."""
@@ -57,7 +58,8 @@ class CredibleSet:
 @dataclass(frozen=True, eq=False)
 class GapVerdict:
     """The verdict, its named effects, all causes and credible sets, the most probable first; `fit` is that of
-    the named effects, `log_odds` those of any effect against none."""
+    the named effects, `log_odds` those of any effect against none, `left` the share of the gap that the named
+    ones leave."""
 
     kind: str
     named: tuple[str, ...]
@@ -67,6 +69,7 @@ class GapVerdict:
     p_unknown: float
     fit: Fitted | None
     log_odds: float = 0.0
+    left: float = 0.0
 
     def ambiguous(self) -> Cause | None:
         """The most probable of the named causes that cannot be distinguished from others."""
@@ -75,7 +78,7 @@ class GapVerdict:
     def withheld_on_unseen_drives(self, significant: bool = True) -> Self:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
         well, as it may come from these, or where the test is not `significant` at a stricter threshold."""
-        if significant and self.kind != "unknown" and self.log_odds >= 0.0:
+        if significant and self.kind != "unknown" and self.log_odds >= 0.0 and self.left <= MOST_LEFT:
             return self
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
         return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)
@@ -119,7 +122,9 @@ def judge(
     likely = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
     kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
-    return GapVerdict(kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds)
+    return GapVerdict(
+        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best, 0.0)
+    )
 
 
 def most_probable(sets: Mapping[Sets, float]) -> Sets:

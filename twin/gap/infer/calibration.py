@@ -71,8 +71,7 @@ def probabilities(
     """Of the sets and of an unknown cause, given that there is a gap.
 
     The evidence for an unknown cause is that of a change along the nuisance basis, or the greatest that the
-    p-value of the gap allows (Sellke, Bayarri and Berger 2001, eq. 3): a gap of any shape. The share of the
-    gap that a set leaves is the probability (assumed) that it only resembles the cause.
+    p-value of the gap allows (Sellke, Bayarri and Berger 2001, eq. 3): a gap of any shape.
     """
     names, values = _weighted(found, effects, head.temperature)
     p = min(max(p_value, 1e-300), math.exp(-1.0))
@@ -80,5 +79,4 @@ def probabilities(
     values = np.append(values, outside + head.unknown)
     shares = np.exp(values - values.max())
     shares = (1.0 - LAPSE) * shares / shares.sum() + LAPSE / len(shares)
-    shares[:-1] *= 1.0 - np.array([found.left.get(name, 0.0) for name in names])
-    return dict(zip(names, shares[:-1].tolist(), strict=True)), float(1.0 - shares[:-1].sum())
+    return dict(zip(names, shares[:-1].tolist(), strict=True)), float(shares[-1])

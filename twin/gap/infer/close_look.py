@@ -82,16 +82,21 @@ class CloseLook:
         """Fits of all laws alone and of the pairs that look promising.
 
         A second law counts only where it explains most of what the first leaves: a law that is not quite the
-        robot's leaves something of the shape of no law, a part of which any other explains.
+        robot's leaves something of the shape of no law, a part of which any other explains. The evidence of
+        both is then that of the first.
         """
         found: dict[tuple[int, ...], Fitted] = {(i,): self.fit((i,)) for i in self.index}
         best = sorted(self.index, key=lambda i: -found[i,].evidence)[:FIRST]
         guess = self._pairs()
         pairs = {*sorted(guess, key=lambda pair: -guess[pair])[:PAIRS]}
         pairs |= {(min(pair), max(pair)) for pair in itertools.combinations(best, 2)} & guess.keys()
-        both = {pair: self.fit(pair) for pair in sorted(pairs)}
-        least = {(a, b): min(found[a,].left, found[b,].left) for a, b in both}
-        return found | {pair: fit for pair, fit in both.items() if fit.left <= LEFT * least[pair]}
+        for pair in sorted(pairs):
+            both, first = self.fit(pair), min(pair, key=lambda i: found[i,].left)
+            if both.left <= LEFT * found[first,].left:
+                found[pair] = both
+            elif both.evidence > found[first,].evidence:
+                found[first,] = dataclasses.replace(found[first,], evidence=both.evidence)
+        return found
 
     def _pairs(self) -> dict[tuple[int, int], float]:
         """Log likelihood ratio of every pair of effects to first sight: one at its best alone, the other

@@ -88,15 +88,13 @@ def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     assert none.sets == []
 
 
-def test_a_set_is_as_certain_as_the_share_of_the_gap_that_it_explains() -> None:
-    most = verdict({("mass",): 600.0}, left={("mass",): 0.3})
-    assert most.named == ("mass",)
-    assert most.sets[0].probability == pytest.approx(0.7, abs=0.02)
-    assert most.p_unknown == pytest.approx(0.3, abs=0.02)
-    little = verdict({("mass",): 600.0, ("gyro_bias", "mass"): 500.0}, left={("mass",): 0.7})
-    assert little.kind == "unknown"
-    assert little.named == ()
-    assert little.p_unknown == pytest.approx(0.7, abs=0.02)
+def test_on_unseen_drives_an_effect_that_explains_less_than_half_of_the_gap_is_not_named() -> None:
+    for left, kind in ((0.3, "effect"), (0.7, "no_gap")):
+        found = verdict({("mass",): 600.0}, left={("mass",): left})
+        assert found.named == ("mass",)
+        withheld = found.withheld_on_unseen_drives()
+        assert withheld.kind == kind
+        assert withheld.sets[0].named == (kind == "effect")
 
 
 def test_an_extrapolated_p_value_is_little_evidence_of_an_unknown_cause_on_other_drives() -> None:

@@ -75,11 +75,11 @@ def test_a_second_law_explains_most_of_what_the_first_leaves(odd: float, both: b
         m, Laws.of(CANDIDATES, {}, m.shared, m.none), (SCALE, BIAS),
         {SCALE: extra, BIAS: extra}, {SCALE: GIVEN, BIAS: 1.0},
     )  # fmt: skip
-    found = look.search()
-    pair = (min(SCALE, BIAS), max(SCALE, BIAS))
-    alone = max(found[SCALE,].evidence, found[BIAS,].evidence)
-    assert look.fit(pair).evidence > alone + 50.0
+    found, pair = look.search(), (min(SCALE, BIAS), max(SCALE, BIAS))
+    alone, together = look.fit((SCALE,)).evidence, look.fit(pair).evidence
+    assert together > alone + 50.0
     assert (pair in found) == both
+    assert found[SCALE,].evidence == (alone if both else together)
 
 
 def test_wheels_of_both_sides_are_one_sensor() -> None:
