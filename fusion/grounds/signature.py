@@ -9,7 +9,18 @@ import math
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, periodogram, sample_rate_hz
+from terrafusion.fusion.terrain.features import (
+    HIGH_HZ,
+    HORIZONTAL,
+    LOW_HZ,
+    MID_HZ,
+    MIN_SPEED_MPS,
+    ROLL_PITCH,
+    VERTICAL,
+    AxesBand,
+    Window,
+    band_powers,
+)
 
 VIBRATION = ("z_low", "z_mid", "z_high", "xy_low", "xy_mid", "tilt_low", "tilt_mid")
 SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide", "slip")
@@ -17,7 +28,11 @@ SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide", "slip")
 gyro over that of the wheels; acceleration of the body over that of the wheels; probability of slippery
 friction, and slip. Only fixes give the last two: they tell grounds apart that are learned."""
 
-BANDS_HZ = ((3.0, 8.0), (8.0, 14.0), (14.0, 45.0))
+BANDS: tuple[AxesBand, ...] = (
+    *((VERTICAL, band) for band in (LOW_HZ, MID_HZ, HIGH_HZ)),
+    *((axes, band) for axes in (HORIZONTAL, ROLL_PITCH) for band in (LOW_HZ, MID_HZ)),
+)
+"""Of `VIBRATION`."""
 LEAST_YAW_RADPS, LEAST_SURGE_MPS2 = 0.15, 0.3
 """Least yaw rate and acceleration of the wheels whose share is measurable (assumed)."""
 MOST_SHARE = 1.5
@@ -57,21 +72,7 @@ class SignatureExtractor:
 
 def _band_powers(window: Window) -> Array:
     """Mean square (7,) in the bands; NaN where the samples do not reach them."""
-    out = np.full(len(FLOORS), np.nan)
-    rate = sample_rate_hz(window.imu_t_s)
-    if rate is None:
-        return out
-    density = periodogram(np.hstack([window.accel_mps2, window.gyro_radps[:, :2]]), rate)
-    frequency = np.arange(len(density)) * rate / len(window.imu_t_s)
-    at = 0
-    for columns, bands in ((slice(2, 3), BANDS_HZ), (slice(0, 2), BANDS_HZ[:2]), (slice(3, 5), BANDS_HZ[:2])):
-        for low, high in bands:
-            if rate >= 2.1 * high:
-                rows = (frequency >= low) & (frequency < high)
-                out[at] = float(density[rows, columns].sum(axis=1).mean()) * (high - low)
-            at += 1
-    out[out == 0.0] = np.nan
-    return out
+    return band_powers(window.imu_t_s, window.accel_mps2, window.gyro_radps, BANDS)
 
 
 def _stands(window: Window) -> bool:

@@ -15,6 +15,7 @@ factor is divided out, v being the faster of robot and wheels: wheels that spin 
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +29,22 @@ SLIP = FEATURES.index("slip")
 YAW_SLIP = FEATURES.index("yaw_slip")
 BANDS_HZ = ((1.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 14.0), (14.0, 20.0), (20.0, 30.0), (30.0, 45.0))
 LOW_HZ, MID_HZ, HIGH_HZ = (3.0, 8.0), (8.0, 14.0), (14.0, 45.0)
+AxesBand = tuple[slice, tuple[float, float]]
+"""Columns of accelerometer x, y, z and gyro x, y that are added, and a band of frequency, Hz."""
+HORIZONTAL, VERTICAL, ROLL_PITCH = slice(0, 2), slice(2, 3), slice(3, 5)
 MIN_SPEED_MPS = 0.15
 """Below this the ground is unobservable: no vibration, and slip is a quotient of two noises."""
 
 _MIN_YAW_RATE_RADPS = 0.15
 _MIN_SPAN_S = 0.6
-_ACCEL_FLOOR_MPS2 = 1e-3
-_GYRO_FLOOR_RADPS = 1e-4
+_WIDE_HZ = (LOW_HZ[0], MID_HZ[1])
+_LEVELS: tuple[AxesBand, ...] = (
+    *((VERTICAL, band) for band in (LOW_HZ, MID_HZ, HIGH_HZ)),
+    (HORIZONTAL, _WIDE_HZ),
+    (ROLL_PITCH, _WIDE_HZ),
+)
+_FLOORS = np.array([1e-3] * 4 + [1e-4])
+"""Least levels of `_LEVELS`, m/s2 and rad/s."""
 _LEAST_POWER = 1e-7
 _TIMING_S = 0.05
 _LEAST_INFORMATION = 1.0
@@ -128,39 +138,28 @@ def slip_without_prior(
 
 
 def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
-    """log10 band RMS (5,) of one window of samples (n,), (n, 3), (n, 3); NaN where not observed.
+    """log10 band RMS (5,) of one window of samples (n,), (n, 3), (n, 3); NaN where not observed."""
+    return np.asarray(0.5 * np.log10(band_powers(t_s, accel_mps2, gyro_radps, _LEVELS) + _FLOORS**2))
+
+
+def band_powers(t_s: Array, accel_mps2: Array, gyro_radps: Array, bands: Sequence[AxesBand]) -> Array:
+    """Mean square (k,) of one window of samples (n,), (n, 3), (n, 3) in k bands; NaN where not observed.
 
     Recorded times jitter more than the sampling of an IMU: samples are taken as evenly spaced, unless a
     gap shows that some are missing.
     """
-    levels = np.full(SLIP, np.nan)
+    powers = np.full(len(bands), np.nan)
     rate = sample_rate_hz(t_s)
     if rate is None:
-        return levels
-    n = len(t_s)
-    signals = np.hstack([accel_mps2, gyro_radps[:, :2]])
-    density = periodogram(signals, rate)
-    frequency = np.arange(len(density)) * rate / n
-
-    def power(band: tuple[float, float], columns: slice) -> float:
-        if rate < 2.1 * band[1]:
-            return float("nan")
-        rows = (frequency >= band[0]) & (frequency < band[1])
-        return float(density[rows, columns].sum(axis=1).mean()) * (band[1] - band[0])
-
-    wide = (LOW_HZ[0], MID_HZ[1])
-    powers = np.array(
-        [
-            power(LOW_HZ, slice(2, 3)),
-            power(MID_HZ, slice(2, 3)),
-            power(HIGH_HZ, slice(2, 3)),
-            power(wide, slice(0, 2)),
-            power(wide, slice(3, 5)),
-        ]
-    )
-    floors = np.array([_ACCEL_FLOOR_MPS2] * 4 + [_GYRO_FLOOR_RADPS])
+        return powers
+    density = periodogram(np.hstack([accel_mps2, gyro_radps[:, :2]]), rate)
+    frequency = np.arange(len(density)) * rate / len(t_s)
+    for i, (axes, (low, high)) in enumerate(bands):
+        if rate >= 2.1 * high:
+            rows = (frequency >= low) & (frequency < high)
+            powers[i] = float(density[rows, axes].sum(axis=1).mean()) * (high - low)
     powers[powers == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
-    return np.asarray(0.5 * np.log10(powers + floors**2))
+    return powers
 
 
 def band_levels(t_s: Array, samples: Array) -> Array:
