@@ -28,19 +28,21 @@ from terrafusion.fusion.graph.key_state import (
     DRIFT,
     GNSS_DELAY,
     IMU_ROTATION,
+    LINEAR,
     NAV,
-    POSE,
     VELOCITY,
     among_linear,
 )
+from terrafusion.fusion.graph.keyframe_rows import fill_markov, fill_wheels
 from terrafusion.fusion.graph.node import Node
+from terrafusion.fusion.graph.variables import VARIABLES
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, linearised_steps
 
 Places = NDArray[np.intp]
 T = TypeVar("T")
 
-_PLACES = {ord("x"): POSE, ord("v"): VELOCITY, ord("b"): BIAS}
+_PLACES = {gtsam.Symbol(symbol(0)).chr(): place for symbol, place in VARIABLES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class RowBlock:
         own = nodes[self._at]
         after = nodes[self._at.start + 1 : self._at.stop + 1]
         self._linked = len(after)
-        self._markov = _Markov([node.markov for node in after], self.dim)
+        self._markov = _Markov([node.markov for node in after])
         self._wheels = _Wheels([node.wheels for node in after])
         used = np.full(len(own), self.dim + (self.dim - NAV.stop) + 4)
         self._fixes = _Fixes([node.fixes for node in own], used)
@@ -171,23 +173,20 @@ def _places_of(keys: tuple[int, ...], dim: int) -> tuple[int, ...]:
 class _Markov:
     """Steps of the linear states."""
 
-    def __init__(self, steps: list[MarkovStep | None], dim: int) -> None:
-        n = dim - NAV.stop
+    def __init__(self, steps: list[MarkovStep | None]) -> None:
         known = [step for step in steps if step is not None]
         self._at = np.array([step is not None for step in steps], dtype=bool)
-        names = ("decay", "mean", "sigma")
         self._steps = MarkovStep(
-            *(np.array([getattr(step, name)[:n] for step in known]).reshape(-1, n) for name in names)
+            *(
+                np.array([getattr(step, name) for step in known]).reshape(-1, len(LINEAR))
+                for name in ("decay", "mean", "sigma")
+            )
         )
-        self._n, self._dim = n, dim
 
     def fill(self, rows: Array, before: Array, now: Array) -> None:
         """Rows (n, states, 2 dim + 1)."""
-        steps, at, n = self._steps, self._at, self._n
-        i, own = np.arange(n), np.zeros((len(steps.decay), *rows.shape[1:]))
-        own[:, i, NAV.stop + i] = -steps.decay / steps.sigma
-        own[:, i, self._dim + NAV.stop + i] = 1.0 / steps.sigma
-        own[:, :, -1] = -steps.residual(before[at, :n], now[at, :n]) / steps.sigma
+        own = np.zeros((len(self._steps.decay), *rows.shape[1:]))
+        fill_markov(own, self._steps, before[self._at], now[self._at])
         rows[self._at] = own
 
 
@@ -205,16 +204,14 @@ class _Wheels:
 
     def fill(self, rows: Array, R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array) -> None:
         """Rows (n, 4, 2 dim + 1)."""
-        at, dim = self._at, (rows.shape[2] - 1) // 2
+        at, increments = self._at, self._increments
         R = R_i[at].transpose(0, 2, 1)
         moved, T = np.einsum("kij,kj->ki", R, p_j[at] - p_i[at]), R @ R_j[at]
-        left, *by_states = linearised_steps(moved.T, T.transpose(1, 2, 0), linear[at].T, self._increments)
+        left, *by_states = linearised_steps(moved.T, T.transpose(1, 2, 0), linear[at].T, increments)
         by_before, by_now, by_linear = (H.transpose(2, 0, 1) for H in by_states)
         own = np.zeros((len(moved), *rows.shape[1:]))
-        own[:, :, POSE], own[:, :, dim : dim + POSE.stop] = by_before, by_now
-        own[:, :, dim + NAV.stop : 2 * dim] = by_linear[:, :, : dim - NAV.stop]
-        own[:, :, -1] = -left.T
-        rows[at] = own / self._increments.sigma.T[:, :, None]
+        fill_wheels(own, (left.T, by_before, by_now, by_linear), increments.sigma.T)
+        rows[at] = own
 
 
 def _first_rows(measurements: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph import gnss_factor, velocity_factor
+from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, NAV, POSE, skew
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.variables import VARIABLES
@@ -71,19 +72,28 @@ def _link_rows(before: Node, node: Node, k: int, values: gtsam.Values) -> Array:
     rows = np.zeros((n + linear + WHEEL_ROWS, 2 * dim + 1), order="F")
     _fill_navigation(rows[:n], packed, before, node)
     if node.markov is not None:
-        step, own = node.markov, rows[n : n + linear]
-        sigma, places = step.sigma[:linear], _PLACES[:linear]
-        own[places, 15 + places] = -step.decay[:linear] / sigma
-        own[places, dim + 15 + places] = 1.0 / sigma
-        own[:, 2 * dim] = -step.residual(before.point.linear, node.point.linear)[:linear] / sigma
+        fill_markov(rows[n : n + linear], node.markov, before.point.linear, node.point.linear)
     if node.wheels is not None:
-        wheel = rows[n + linear :]
-        left, H_i, H_j, H_linear = linearised(before.point, node.point, node.wheels)
-        sigma = node.wheels.sigma[:, None]
-        wheel[:, 0:6], wheel[:, dim : dim + 6] = H_i / sigma, H_j / sigma
-        wheel[:, dim + 15 : 2 * dim] = H_linear[:, :linear] / sigma
-        wheel[:, 2 * dim] = -left / node.wheels.sigma
+        fill_wheels(rows[n + linear :], linearised(before.point, node.point, node.wheels), node.wheels.sigma)
     return rows
+
+
+def fill_markov(rows: Array, step: MarkovStep, before: Array, now: Array) -> None:
+    """Fill rows (..., states, 2 dim + 1) with a step of the linear states, (..., 15) before and now."""
+    n, dim = rows.shape[-2], rows.shape[-1] // 2
+    i, sigma = _PLACES[:n], step.sigma[..., :n]
+    rows[..., i, NAV.stop + i] = -step.decay[..., :n] / sigma
+    rows[..., i, dim + NAV.stop + i] = 1.0 / sigma
+    rows[..., -1] = -step.residual(before, now)[..., :n] / sigma
+
+
+def fill_wheels(rows: Array, linearised_at: tuple[Array, Array, Array, Array], sigma: Array) -> None:
+    """Fill rows (..., 4, 2 dim + 1) with wheel factors of 1 sigma (..., 4), as `linearised` gives them."""
+    (left, H_i, H_j, H_linear), dim = linearised_at, rows.shape[-1] // 2
+    wide = sigma[..., None]
+    rows[..., POSE], rows[..., dim : dim + POSE.stop] = H_i / wide, H_j / wide
+    rows[..., dim + NAV.stop : -1] = H_linear[..., : dim - NAV.stop] / wide
+    rows[..., -1] = -left / sigma
 
 
 def linearised_link(node: Node, k: int, values: gtsam.Values) -> Array:
