@@ -45,7 +45,7 @@ class AntennaMotion:
     @classmethod
     def of(cls, chain: Chain, k: int, fix: GnssFix, antenna_m: Array) -> AntennaMotion:
         """At a fix of keyframe k; `antenna_m` without what the chain estimates of it."""
-        node, state = chain.nodes[k - chain.first], chain.state(k)
+        node, state = chain.node(k), chain.state(k)
         delay_s = float(state.of(GNSS_DELAY))
         offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
         R = state.rotation
@@ -94,4 +94,4 @@ def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
         delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
         t_ns = min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns)
     k = chain.at_or_after(t_ns)
-    return None if k is None or chain.nodes[k - chain.first].t_ns - t_ns > APART_NS else k
+    return None if k is None or chain.node(k).t_ns - t_ns > APART_NS else k

@@ -311,7 +311,7 @@ class FrictionEstimator:
         """The link into keyframe k with `more_m2ps` more variance rate; None where the link is not a friction
         link.
         """
-        node, before = chain.nodes[k - chain.first], chain.nodes[k - 1 - chain.first]
+        node, before = chain.node(k), chain.node(k - 1)
         made = next((s for t_ns, s in self._linked if t_ns == node.t_ns), None)
         if made is None or not _is_friction_link(node.link):
             return None

@@ -265,7 +265,7 @@ class GnssUpdater:
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Restart the drift where the class of fix changes; True when it does."""
-        step = chain.nodes[k - chain.first].markov
+        step = chain.node(k).markov
         if not self.fix_noise.changes_class(fix) or step is None:
             return False
         chain.revise(k, step.restarted(slice(1, 3)))

@@ -102,32 +102,44 @@ class Chain:
 
     def add(self, k: int, factor: gtsam.NonlinearFactor) -> None:
         """Add a factor of GTSAM that touches keyframe k alone."""
-        self._changed(k).unary.add(factor)
-        if self.archive is not None:
-            self.archive.add(k, factor)
+        for node in self._changed(k):
+            node.unary.add(factor)
 
     def add_fix(self, k: int, fix: GnssPosition) -> None:
         """Add a GNSS position to keyframe k."""
-        self._changed(k).fixes.append(fix)
-        if self.archive is not None:
-            self.archive.add_fix(k, fix)
+        for node in self._changed(k):
+            node.fixes.append(fix)
 
     def add_velocity(self, k: int, velocity: GnssVelocity) -> None:
         """Add a GNSS velocity to keyframe k."""
-        self._changed(k).velocities.append(velocity)
-        if self.archive is not None:
-            self.archive.add_velocity(k, velocity)
+        for node in self._changed(k):
+            node.velocities.append(velocity)
 
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         """Replace a GNSS position of keyframe k by one of another weight."""
-        fixes = self._changed(k).fixes
-        fixes[fixes.index(old)] = new
-        if self.archive is not None:
-            self.archive.replace_fix(k, old, new)
+        for node in self._changed(k):
+            node.fixes[node.fixes.index(old)] = new
 
-    def _changed(self, k: int) -> Node:
-        """Keyframe k, of which a factor of its own is about to change."""
+    def revise(
+        self,
+        k: int,
+        markov: MarkovStep | None = None,
+        wheels: WheelIncrement | None = None,
+        link: gtsam.NonlinearFactorGraph | None = None,
+    ) -> None:
+        """Another Markov step, wheel increment or link into keyframe k, not the first."""
+        self._changed(k - 1)  # with which the link is eliminated
+        for node in self._changed(k):
+            node.markov, node.wheels = markov or node.markov, wheels or node.wheels
+            node.link = node.link if link is None else link
+
+    def _changed(self, k: int) -> list[Node]:
+        """Keyframe k, here and in the archive, of which a factor is about to change."""
         self._dirty = min(self._dirty, k)
+        return [self.node(k), *(self.archive._changed(k) if self.archive is not None else ())]
+
+    def node(self, k: int) -> Node:
+        """Keyframe k, one of those held."""
         return self.nodes[k - self.first]
 
     def at_or_after(self, t_ns: int) -> int | None:
@@ -141,7 +153,7 @@ class Chain:
 
     def state(self, k: int) -> KeyState:
         """Best state of keyframe k as of the last `solve` (newest) or `smooth` (all)."""
-        return self.nodes[k - self.first].state()
+        return self.node(k).state()
 
     @functools.cached_property
     def covariance(self) -> Array:
@@ -228,7 +240,7 @@ class Chain:
         """
         self._eliminate_all()
         k = self.last if k is None else k
-        node = self.nodes[k - self.first]
+        node = self.node(k)
         known = self._root if k == self.last else triangular(own_rows(node, k, self.values))
         inverse, _ = lapack.dtrtri(known[:, : self.dim])
         mean = inverse @ known[:, self.dim]
@@ -262,21 +274,6 @@ class Chain:
         self._anchor, self._dirty = None, self.first
         self._eliminate_all()
 
-    def revise(
-        self,
-        k: int,
-        markov: MarkovStep | None = None,
-        wheels: WheelIncrement | None = None,
-        link: gtsam.NonlinearFactorGraph | None = None,
-    ) -> None:
-        """Another Markov step, wheel increment or link into keyframe k, not the first."""
-        node = self.nodes[k - self.first]
-        node.markov, node.wheels = markov or node.markov, wheels or node.wheels
-        node.link = node.link if link is None else link
-        self._dirty = min(self._dirty, k - 1)
-        if self.archive is not None:
-            self.archive.revise(k, markov, wheels, link)
-
     def rebuild(self) -> None:
         """Rebuild the variables of GTSAM from the keyframes."""
         self.values, self._inserted = gtsam.Values(), self.first
@@ -309,7 +306,7 @@ class Chain:
 
     def _move(self, k: int) -> None:
         """Make the current estimate of keyframe k its linearisation point."""
-        node = self.nodes[k - self.first]
+        node = self.node(k)
         if k == self.first:
             self._carry_prior()
         node.point = node.state()
@@ -332,11 +329,11 @@ class Chain:
 
     def _publish(self, k: int) -> None:
         self._insert_new()
-        update(self.values, k, self.nodes[k - self.first].point)
+        update(self.values, k, self.node(k).point)
 
     def _stacked(self, k: int) -> Array:
         """Prior and all whitened rows over keyframes k and k + 1, shape (m, 2 dim + 1)."""
-        node, after = self.nodes[k - self.first : k - self.first + 2]
+        node, after = self.node(k), self.node(k + 1)
         link = link_rows(node, after, k + 1, self.values)
         stacked = own_rows(node, k, self.values, len(link), width=2)
         stacked[len(stacked) - len(link) :] = link
@@ -344,15 +341,15 @@ class Chain:
 
     def _eliminate(self, k: int) -> None:
         R = triangular(self._stacked(k))
-        self.nodes[k - self.first].conditional = R[: self.dim]
-        self.nodes[k + 1 - self.first].prior = R[self.dim : 2 * self.dim, self.dim :]
+        self.node(k).conditional = R[: self.dim]
+        self.node(k + 1).prior = R[self.dim : 2 * self.dim, self.dim :]
 
     def _back_substitute_to(self, begin: int, solved: int | None = None) -> int:
         """Solve for the keyframes from `begin` on, those from `solved` on (the newest) being so; `begin`."""
         solved = self.last if solved is None else solved
         nodes = self.nodes[begin - self.first : solved - self.first][::-1]
         conditionals = (node.conditional for node in nodes if node.conditional is not None)
-        found = back_substitute_before(conditionals, self.nodes[solved - self.first].delta)
+        found = back_substitute_before(conditionals, self.node(solved).delta)
         for node, delta in zip(nodes, found, strict=True):
             node.delta = delta
         return begin

@@ -123,7 +123,7 @@ def inflate_slip_covariance(
     passed = range(k, chain.last + 1)
     share = 1.0 - (1.0 - min(switch, MOST_SWITCH)) ** (1.0 / max(len(passed), 1))
     for k in passed:
-        node = chain.nodes[k - chain.first]
+        node = chain.node(k)
         anew = step(dt_s, noise, node.point.rotation[2], drift_sigma_m, drift_time_s, share, node.wheels)
         chain.revise(k, anew if node.markov is None else node.markov.inflated(anew, GROUND_STATES))
 

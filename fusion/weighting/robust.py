@@ -101,7 +101,7 @@ class RobustWeighting(Weighting):
             mu *= MU_GROWTH
         for old, square, (k, fix) in zip(before.tolist(), squares.tolist(), held, strict=True):
             if (old < DOUBTED) != (fix.weight < DOUBTED):
-                t_ns = chain.nodes[k - chain.first].t_ns
+                t_ns = chain.node(k).t_ns
                 self._record(t_ns, old, fix.weight, square**0.5, "sigma over the window")
 
     def _squares(self, chain: Chain, held: list[tuple[int, GnssPosition]]) -> Array:
