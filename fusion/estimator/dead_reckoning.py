@@ -315,7 +315,7 @@ class DeadReckoning:
 
     def error_of(self, fit: PathFit) -> float:
         """Angle, rad, by which the chain's heading must turn to agree with the fit."""
-        return cmath.phase(fit.turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
+        return cmath.phase(fit.turn * self.heading.conjugate())
 
     def antenna(self) -> complex:
         """The dead-reckoned antenna at the newest keyframe, m."""

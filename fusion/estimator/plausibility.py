@@ -67,6 +67,7 @@ MOST_RUNS, MOST_PAIRS = 8, 600
 REPEATS = "the receiver repeats its position while wheels and gyro show motion"
 MIRRORED = "the path of the fixes is the mirror image of that of wheels and gyro (axes swapped, or a sign)"
 BEYOND = "the place lies beyond what the robot can have driven"
+REASONS = (REPEATS, MIRRORED, BEYOND, JUMPED)
 
 
 @dataclass
@@ -140,7 +141,8 @@ class FixPlausibility:
         runs: fixes refused since then; run: the newest one's.
         mirrored: east and north are swapped, or one is reversed.
         jump_m: from the place left to the place believed, and the reach then; None where there is no doubt.
-        repeated, turned, beyond, jumped, jumps: fixes not used, by reason, and jumps beyond reach.
+        unused: by reason, how many fixes were not used.
+        jumps, returns: how often a place beyond reach was believed, and the one before it again.
         skids: jumps that may be a skid, too, and were followed.
     """
 
@@ -150,10 +152,7 @@ class FixPlausibility:
     mirrored: bool = False
     jump_m: complex | None = None
     jump_at_m: float = 0.0
-    repeated: int = 0
-    turned: int = 0
-    beyond: int = 0
-    jumped: int = 0
+    unused: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
     skids: int = 0
     jumps: int = 0
     returns: int = 0
@@ -174,7 +173,6 @@ class FixPlausibility:
         """
         moved_m = self._position.moved_m(pair, estimate)
         if moved_m > max(REPEATED_WAY_M, pair.sigma_m):
-            self.repeated += 1
             return self._refused(pair, REPEATS)
         if self.mirrored:
             self._since.append(pair)
@@ -183,7 +181,6 @@ class FixPlausibility:
             self._since.clear()
         if self.mirrored:
             del self._since[:-MOST_PAIRS]
-            self.turned += 1
             return self._refused(pair, MIRRORED)
         run = self.run
         if run is not None and run.held and run.follows(pair):
@@ -199,7 +196,6 @@ class FixPlausibility:
             self._believed = True
             return None
         pair.usable = False
-        self.jumped += 1
         return self._refused(pair, JUMPED)
 
     def _move(self, run: FixRun, pair: FixPair, share: float, fades_m: float) -> None:
@@ -224,17 +220,14 @@ class FixPlausibility:
             self.run.pairs[0].alone = False
         if any(PathShape.of(pairs).is_mirrored() for pairs in (track.pairs, self.run.pairs)):
             self.mirrored, self._since = True, []
-            self.turned += 1
             self._refused(pair, MIRRORED)
             return False
         if self.run.reachable:
             return False
         self._doubt_m = pair.fix - estimate
         if self.run.held:
-            self.jumped += 1
             self._refused(pair, JUMPED)
             return False
-        self.beyond += 1
         self._refused(pair, BEYOND)
         if not self.run.is_evidence(scale, track.heading):
             return False
@@ -298,11 +291,7 @@ class FixPlausibility:
 
     def notes(self) -> list[str]:
         """What was made of the fixes, in sentences."""
-        out, counts = [], (self.repeated, self.turned, self.beyond, self.jumped)
-        reasons = zip(counts, (REPEATS, MIRRORED, BEYOND, JUMPED), strict=True)
-        for count, why in reasons:
-            if count:
-                out.append(f"{count} GNSS fixes were not used: {why}")
+        out = [f"{count} GNSS fixes were not used: {why}" for why, count in self.unused.items() if count]
         if self.jumps:
             out.append(
                 f"{self.jumps} times fixes beyond reach traced the path of wheels and gyro for so long that "
@@ -318,6 +307,7 @@ class FixPlausibility:
         return out
 
     def _refused(self, pair: FixPair, why: str) -> str:
+        self.unused[why] += 1
         self._in_a_row += 1
         self._refused_ns = pair.t_ns
         return why
