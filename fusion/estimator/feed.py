@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.heap import older_objects_unsearched
-from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample, Message
+from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -103,6 +103,7 @@ def _complete_wheels(wheels: Wheels) -> Wheels:
     return wheels
 
 
+@older_objects_unsearched()
 def feed(
     estimator: Estimator, recording: Recording, progress: Callable[[float], None] | None = None
 ) -> np.ndarray:
@@ -113,20 +114,10 @@ def feed(
     """
     clock = recording.imu if recording.imu is not None else recording.wheels
     assert clock is not None
-    with older_objects_unsearched():
-        return _fed(estimator, recording.messages(), int(clock.t_ns[0]), int(clock.t_ns[-1]), progress)
-
-
-def _fed(
-    estimator: Estimator,
-    messages: Iterator[Message],
-    first_ns: int,
-    last_ns: int,
-    progress: Callable[[float], None] | None,
-) -> np.ndarray:
+    first_ns, last_ns = int(clock.t_ns[0]), int(clock.t_ns[-1])
     latencies: list[float] = []
     newest = estimator.latest()
-    for message in _until(messages, last_ns):
+    for message in itertools.takewhile(lambda message: message.t_ns <= last_ns, recording.messages()):
         begun = time.perf_counter()
         if isinstance(message, ImuSample):  # complete, as `with_usable_samples` leaves them
             estimator.add_imu(*message)
@@ -143,10 +134,6 @@ def _fed(
     if progress is not None:
         progress(1.0)
     return np.array(latencies)
-
-
-def _until(messages: Iterator[Message], last_ns: int) -> Iterator[Message]:
-    return itertools.takewhile(lambda message: message.t_ns <= last_ns, messages)
 
 
 def too_short() -> DataError:

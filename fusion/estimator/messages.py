@@ -33,7 +33,7 @@ Arguments = tuple[Any, ...]
 
 
 def arguments_of(message: Message, config: EstimatorConfig) -> tuple[str, Arguments] | None:
-    """Channel of a message and what the estimator's method for it takes after the time; None if left out.
+    """The estimator's method for a message and what it takes after the time; None if left out.
 
     Left out are rows with missing values that the graph needs, fixes of class "none", ground labels that a
     person or the simulation gave, motor currents, and the magnetometer (use `add_magnetic_field`).
@@ -41,10 +41,10 @@ def arguments_of(message: Message, config: EstimatorConfig) -> tuple[str, Argume
     Raises:
         DataError: it is no message.
     """
-    for kind, (channel, read) in _READERS.items():
+    for kind, (method, read) in _READERS.items():
         if isinstance(message, kind):
             arguments = read(message, config)
-            return None if arguments is None else (channel, arguments)
+            return None if arguments is None else (method, arguments)
     if not isinstance(message, tuple):
         raise DataError(
             f"a {type(message).__name__} is no message",
@@ -114,13 +114,13 @@ def _wheels(message: WheelSample, config: EstimatorConfig) -> Arguments | None:
 
 
 _READERS: dict[type, tuple[str, Callable[..., Arguments | None]]] = {
-    ImuSample: ("imu", _imu),
-    WheelSample: ("wheels", _wheels),
-    GnssSample: ("gnss", _gnss),
-    CommandSample: ("command", _command),
-    SteeringSample: ("steering", _steering),
-    BarometerSample: ("barometer", _barometer),
-    TerrainSample: ("terrain", _terrain),
+    ImuSample: ("add_imu", _imu),
+    WheelSample: ("add_wheels", _wheels),
+    GnssSample: ("add_gnss", _gnss),
+    CommandSample: ("add_command", _command),
+    SteeringSample: ("add_steering", _steering),
+    BarometerSample: ("add_pressure", _barometer),
+    TerrainSample: ("add_terrain", _terrain),
 }
 
 

@@ -98,6 +98,7 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
     return judge(Run(recording, estimate, scores, alone, recording.gnss, found, rig, corrections))
 
 
+@older_objects_unsearched()
 def run(
     estimator: Estimator,
     messages: Iterable[Message],
@@ -105,13 +106,6 @@ def run(
     realtime: bool = False,
 ) -> Latencies:
     """Feed messages as they arrive and publish odometry after every IMU sample, once there is a start."""
-    with older_objects_unsearched():
-        return _run(estimator, messages, publish, realtime)
-
-
-def _run(
-    estimator: Estimator, messages: Iterable[Message], publish: Callable[[State], None], realtime: bool
-) -> Latencies:
     taken, began, first_ns = Latencies(), time.perf_counter(), None
     for message in messages:
         first_ns = message.t_ns if first_ns is None else first_ns
