@@ -20,6 +20,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.friction import FrictionEstimator
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
+from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -90,34 +91,29 @@ class SkidDetector:
             return False
         begin = chain.at_or_after(since_ns)
         begin = chain.first if begin is None else begin
-        passed = range(begin + 1, k + 1)
-        nodes = [chain.nodes[i - chain.first] for i in passed]
-        rolled_m = [abs(node.wheels.distance_m) for node in nodes if node.wheels is not None]
-        if not rolled_m:
+        nodes = [chain.node(i) for i in range(begin + 1, k + 1)]
+        if all(node.wheels is None for node in nodes):
             return False
-        ends_ns = [chain.nodes[i - 1 - chain.first].t_ns for i in passed] + [nodes[-1].t_ns]
-        steps_s = np.diff(ends_ns) * 1e-9
-        driven_s = [
-            dt * driving(node.point, node.wheels, dt) for dt, node in zip(steps_s, nodes, strict=True)
-        ]
-        fastest_mps = max(float(np.linalg.norm(node.point.velocity)) for node in nodes)
-        off_m, reach_m = float(np.linalg.norm(refused[-1])), sum(rolled_m) + fastest_mps * float(sum(steps_s))
+        steps_s = np.diff([chain.node(i).t_ns for i in range(begin, k + 1)]) * 1e-9
+        steps = list(zip(steps_s, nodes, strict=True))
+        seconds, driven_s = sum(steps_s), sum(dt * driving(n.point, n.wheels, dt) for dt, n in steps)
+        off_m, reach_m = float(np.linalg.norm(refused[-1])), _reach_m(nodes, seconds)
         if off_m > reach_m + REACH_SIGMA * sigma_m:
             return False
         skidded_m = min(off_m, reach_m)  # what is beyond reach is the fix's own error
-        more_m2ps = max(0.5 * skidded_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps, 0.0)
+        more_m2ps = max(0.5 * skidded_m**2 / max(driven_s, 1e-9) - self.rate_m2ps, 0.0)
         if len(refused) > 1:
             doubt = np.zeros(chain.dim)
-            doubt[VELOCITY][:2] = (skidded_m / max(float(sum(steps_s)), LEAST_GAP_S)) ** 2
+            doubt[VELOCITY][:2] = (skidded_m / max(seconds, LEAST_GAP_S)) ** 2
             chain.restart(doubt, begin)
         elif more_m2ps == 0.0:
             return False
-        self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in zip(passed, nodes, strict=True)]
+        self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in enumerate(nodes, begin + 1)]
         self.rate_m2ps += more_m2ps
         self.refutations += 1
         # Over all of the time: wheels that are locked do not say when a robot stops.
-        m2ps = more_m2ps * sum(driven_s) / max(float(sum(steps_s)), 1e-9)
-        for i, node, dt_s in zip(passed, nodes, steps_s.tolist(), strict=True):
+        m2ps = float(more_m2ps * driven_s / max(seconds, 1e-9))
+        for i, (dt_s, node) in enumerate(steps, begin + 1):
             if node.wheels is not None:
                 inflated = self.friction.inflated_link(chain, i, m2ps, noise) if self.friction else None
                 chain.revise(i, wheels=node.wheels.with_extra_variance(m2ps * dt_s), link=inflated)
@@ -182,6 +178,12 @@ def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> flo
     rolled_mps = 0.0 if wheels is None else abs(wheels.distance_m) / dt_s
     square = max(rolled_mps, math.sqrt(before.velocity @ before.velocity)) ** 2
     return square / (square + DRIVING_MPS**2)
+
+
+def _reach_m(nodes: list[Node], seconds: float) -> float:
+    """How far a robot can have skidded up to the keyframes `nodes`: its wheels' distance and its speed's."""
+    rolled_m = sum(abs(node.wheels.distance_m) for node in nodes if node.wheels is not None)
+    return rolled_m + max(float(np.linalg.norm(node.point.velocity)) for node in nodes) * seconds
 
 
 def _on_one_side(refused: list[Array]) -> bool:

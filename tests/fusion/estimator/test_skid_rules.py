@@ -49,6 +49,9 @@ class Recorder:
     def at_or_after(self, t_ns: int) -> int | None:
         return next((i + self.first for i, node in enumerate(self.nodes) if node.t_ns >= t_ns), None)
 
+    def node(self, k: int) -> Node:
+        return self.nodes[k - self.first]
+
     def restart(self, doubt: np.ndarray, begin: int) -> None:
         self.calls.append(("restart", doubt, begin))
 
