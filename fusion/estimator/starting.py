@@ -62,41 +62,55 @@ class StartSearch:
         covered = wheels.covers(level_ns) or imu.covers(level_ns + WINDOW_NS)
         if not last and not (covered and imu.covers(level_ns)):
             return None
-        elapsed_s = (imu.t_ns[-1] - begin) * 1e-9
         if self.level is None:
             self.level = level_start(imu, wheels, begin)
         if self.known is None:
             self.known = self._aids.start(self.level, imu, self._gnss.waiting)
         if self.known is not None:
             return self.known.at(self.level)
-        fixes = self._gnss.waiting
-        if fixes and self._gnss.have_new():
-            self._newest_fix_came_ns = imu.t_ns[-1]
-            fitting = plausible_fixes(fixes, wheels)
-            place = self._antenna_m, self._ahead_m, self._doubt
-            found = heading_from_motion(imu, wheels, fitting, self.level, *place, steering)
-            if found is not None and self._clear(found, imu.t_ns[-1]):
-                self._gnss.refuse_waiting(fitting)
-                return found.start
-            self._rough = found
-            if drop_before_start(imu, wheels, fixes):
-                self.level = self._rough = None
-        elif fixes and (last or imu.t_ns[-1] - self._newest_fix_came_ns > SILENT_NS):
-            rough = self._rough
-            if rough is None:
+        now_ns = imu.t_ns[-1]
+        if not self._gnss.waiting:
+            if not last and (now_ns - begin) * 1e-9 <= self._config.longest_wait_s:
                 return None
-            if rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD and rough.fixes_decide():
-                self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
-                return rough.start
-            if rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD or len(fixes) >= MANY_FIXES:
-                start = rough.alone()
-                self._gnss.place(start)
-                self.known = dataclasses.replace(start, yaw_sigma_rad=self.level.yaw_sigma_rad)
-                return self.known.at(self.level)
-        elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
             self._gnss.local = True
             return self.level
+        if self._gnss.have_new():
+            self._newest_fix_came_ns = now_ns
+            return self._by_motion(imu, wheels, steering, self.level)
+        if last or now_ns - self._newest_fix_came_ns > SILENT_NS:
+            return self._by_rough_heading(wheels, self.level)
         return None
+
+    def _by_motion(
+        self, imu: ImuStream, wheels: WheelStream, steering: SteeringStream, level: Start
+    ) -> Start | None:
+        """The start by the fixes so far, once they show the heading clearly."""
+        fitting = plausible_fixes(self._gnss.waiting, wheels)
+        place = self._antenna_m, self._ahead_m, self._doubt
+        found = heading_from_motion(imu, wheels, fitting, level, *place, steering)
+        if found is not None and self._clear(found, imu.t_ns[-1]):
+            self._gnss.refuse_waiting(fitting)
+            return found.start
+        self._rough = found
+        if drop_before_start(imu, wheels, self._gnss.waiting):
+            self.level = self._rough = None
+        return None
+
+    def _by_rough_heading(self, wheels: WheelStream, level: Start) -> Start | None:
+        """The start by the heading that there is, where no more fixes come."""
+        rough, fixes = self._rough, self._gnss.waiting
+        if rough is None:
+            return None
+        tells_forward = rough.start.yaw_sigma_rad <= ROUGH_YAW_RAD
+        if tells_forward and rough.fixes_decide():
+            self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
+            return rough.start
+        if not tells_forward and len(fixes) < MANY_FIXES:
+            return None
+        start = rough.alone()
+        self._gnss.place(start)
+        self.known = dataclasses.replace(start, yaw_sigma_rad=level.yaw_sigma_rad)
+        return self.known.at(level)
 
     def _clear(self, found: MotionStart, now_ns: int) -> bool:
         if found.random_rad > self._config.yaw_sigma_start_rad:
