@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,11 +39,11 @@ class MotionSegment:
     t_s: Array
     distance_m: Array
     turn_rad: Array
-    fix_t_s: Array
-    fix: Complex
-    fix_sigma_m: Array
-    antenna_m: complex
-    first: NDArray[np.intp]
+    fix_t_s: Array = field(default_factory=lambda: np.zeros(0))
+    fix: Complex = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    fix_sigma_m: Array = field(default_factory=lambda: np.zeros(0))
+    antenna_m: complex = 0j
+    first: NDArray[np.intp] = field(default_factory=lambda: np.zeros(1, dtype=np.intp))
     course_rad: Array | None = None
 
 

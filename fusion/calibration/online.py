@@ -50,7 +50,8 @@ class SelfCalibration:
     def _begin(self) -> None:
         self._start_ns: int | None = None
         self._start: tuple[complex, float] = (0j, 0.0)
-        self._drive = _empty(self._antenna_m)
+        none = np.zeros(0)
+        self._drive = MotionSegment(np.zeros(1), none, none, antenna_m=self._antenna_m, course_rad=none)
         self._first: list[int] = [0]
         self._now_s, self._node_s, self._stepped_s, self._rolled_m = 0.0, 0.0, 0.0, 0.0
         # Newer than `_drive`: time, distance, turn, course of samples; time, east, north, sigma of fixes.
@@ -169,12 +170,6 @@ class SelfCalibration:
         state[known:, 0], state[known:, 1], state[known:, 2] = at.real, at.imag, yaw + path.yaw_rad[new]
         state[known:, 3:] = last[3:]
         return Nodes(drive, state)
-
-
-def _empty(antenna_m: complex) -> MotionSegment:
-    none = np.zeros(0)
-    at_start = np.zeros(1, dtype=int)
-    return MotionSegment(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, at_start, none)
 
 
 def _extended(

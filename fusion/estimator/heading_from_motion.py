@@ -54,9 +54,6 @@ class MotionDoubt:
     drift_time_s: float
 
 
-NO_FIXES = np.zeros(0), np.zeros(0, dtype=np.complex128), np.zeros(0)
-
-
 @dataclass(frozen=True, eq=False)
 class MotionStart:
     """What fixes and dead reckoning show of the start.
@@ -244,7 +241,7 @@ def _antenna_path(
         t_ns = [wheels.t_ns[i] for i in index]
         course = np.array([steering.course_rad(a, b) for a, b in itertools.pairwise(t_ns)])
         ahead = ahead * np.cos(course)
-    drive = MotionSegment(t_s, ahead, turns, *NO_FIXES, lever, np.zeros(1, dtype=np.intp), course)
+    drive = MotionSegment(t_s, ahead, turns, course_rad=course)
     numbers = np.zeros(len(NUMBERS))
     numbers[GYRO_BIAS] = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0
     path = dead_reckoned(drive, numbers)
