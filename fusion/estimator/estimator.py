@@ -36,8 +36,9 @@ from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import state_fields
-from terrafusion.fusion.estimator.keyframe_motion import KeyframeMotion, MeanMotion, MotionInput
+from terrafusion.fusion.estimator.keyframe_motion import KeyframeMotion, MotionInput
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.estimator.messages import arguments_of
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
@@ -146,17 +147,8 @@ class Estimator:
             if isinstance(message, ImuSample) and self.config.inputs.imu == "six_axis":
                 self.imu.leave_out(message.gyro_radps)
             return
-        inlets: dict[str, Callable[..., None]] = {
-            "imu": self.add_imu,
-            "wheels": self.add_wheels,
-            "gnss": self.add_gnss,
-            "command": self.add_command,
-            "steering": self.add_steering,
-            "barometer": self.add_pressure,
-            "terrain": self.add_terrain,
-        }
-        channel, arguments = read
-        inlets[channel](message.t_ns, *arguments)
+        method, arguments = read
+        getattr(self, method)(message.t_ns, *arguments)
 
     def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
         """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.
@@ -395,8 +387,7 @@ class Estimator:
         if fresh is None:
             return
         state, mean = fresh
-        readings = mean.gyro_radps, mean.accel_mps2
-        self.learned.keyframe(self.chain, mean.dt_s, mean.rolled_m, mean.course_rad, *readings)
+        self.learned.keyframe(self.chain, mean)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.calibration.mounting import Angle
 from terrafusion.fusion.calibration.tilt import LEAST_SIGMA_RAD, MountingTilt
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
 from terrafusion.fusion.inputs.streams import ImuStream
@@ -106,29 +107,16 @@ class ImuLevel:
         if math.isfinite(float(fix.enu_m[2]) + sigma_m):
             self._new |= self._seen.height(float(fix.enu_m[2]), sigma_m)
 
-    def keyframe(
-        self,
-        chain: Chain,
-        dt_s: float,
-        rolled_m: float,
-        gyro_radps: Array,
-        accel_mps2: Array,
-        yaw_sigma_rad: float,
-    ) -> None:
-        """Take the motion over `dt_s` up to the newest keyframe.
-
-        Args:
-            rolled_m: mean distance of the wheels.
-            gyro_radps, accel_mps2: (3,) mean readings, corrected.
-            yaw_sigma_rad: 1 sigma of the angle of the IMU about z.
-        """
-        if self._held:
+    def keyframe(self, chain: Chain, mean: MeanMotion, yaw_sigma_rad: float) -> None:
+        """Take the motion up to the newest keyframe; `yaw_sigma_rad` is of the IMU's angle about z."""
+        if self._held or mean.rolled_m is None:
             return
-        state = chain.state(chain.last)
+        speed_mps = mean.rolled_m * chain.state(chain.last).rolling / mean.dt_s
+        gyro_radps, accel_mps2 = mean.gyro_radps, mean.accel_mps2
         back = self._back(self._imu.mounting_rad)
         if back is not None:
             gyro_radps, accel_mps2 = back @ gyro_radps, back @ accel_mps2
-        self._new |= self._seen.add(dt_s, rolled_m * state.rolling / dt_s, gyro_radps, accel_mps2)
+        self._new |= self._seen.add(mean.dt_s, speed_mps, gyro_radps, accel_mps2)
         if not self._new:
             return
         self._new, yaw = False, self._imu.mounting_rad

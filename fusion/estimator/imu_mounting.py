@@ -13,6 +13,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, LEAST_SIGMA_RAD, Angle, MountingAngle
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.imu_level import ImuLevel
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
@@ -58,25 +59,23 @@ class ImuMounting:
         self.start_from(other.known)
         self.level.start_from(other.level.known)
 
-    def keyframe(
-        self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
-    ) -> None:
-        """Take the motion over `dt_s` up to the newest keyframe, by the wheels and the mean readings (3,) of
-        the IMU.
-        """
+    def keyframe(self, chain: Chain, mean: MeanMotion) -> None:
+        """Take the motion up to the newest keyframe."""
         if not self.learns:
             return
-        if rolled_m is None:
+        if mean.rolled_m is None:
             self._seen.interrupt()
             self.level.interrupt()
             return
-        self.level.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2, self.known.sigma_rad)
+        self.level.keyframe(chain, mean, self.known.sigma_rad)
         bias = chain.state(chain.last).bias
-        turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
-        raw = turned(accel_mps2, -self._imu.mounting_rad) if self._imu.mounting_rad else accel_mps2
-        if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
+        turn_rad = (float(mean.gyro_radps[2]) - float(bias.gyroscope()[2])) * mean.dt_s
+        was_rad, raw = self._imu.mounting_rad, mean.accel_mps2
+        if was_rad:
+            raw = turned(raw, -was_rad)
+        if not self._seen.add(mean.dt_s, mean.rolled_m, turn_rad, raw) or self._seen.angle is None:
             return
-        was_rad, seen = self._imu.mounting_rad, self._seen.angle
+        seen = self._seen.angle
         found = seen.as_mounted() if self.before.sigma_rad == ANY_ANGLE_RAD else self.before.combined(seen)
         self.known, clear = self.before.corrected(found, self.corrects, CLEAR_SIGMA, LEAST_RAD)
         self.corrects_since_ns = (self.corrects_since_ns or chain.nodes[-1].t_ns) if clear else None

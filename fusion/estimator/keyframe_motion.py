@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.steering import steered_turn
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
@@ -18,23 +18,6 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import LONGEST_PAUSE_NS, ImuSegment, ImuStream, WheelStream, is_gap
 from terrafusion.fusion.noise.policy import SensorNoise
-
-
-@dataclass(frozen=True, eq=False)
-class MeanMotion:
-    """Motion over `dt_s` up to a keyframe.
-
-    Attributes:
-        rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
-        course_rad: of the wheels, as steered, from the body's x axis.
-        gyro_radps, accel_mps2: (3,) mean readings, corrected.
-    """
-
-    dt_s: float
-    rolled_m: float | None
-    course_rad: float
-    gyro_radps: Array
-    accel_mps2: Array
 
 
 @dataclass(frozen=True, eq=False)

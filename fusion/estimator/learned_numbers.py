@@ -10,6 +10,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.robot import SKIDDING, SensorNumbers
+from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -34,12 +35,12 @@ from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.imu_level import LEVEL
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
-from terrafusion.fusion.estimator.turn_doubt import with_turn_doubt
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.kept import Kept
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, KeyState
 from terrafusion.fusion.graph.slow_states import SLIP_STEADY
-from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream
+from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, mean_yaw_rate_radps
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -53,6 +54,10 @@ LEAST_SLIP_SIGMA = 0.02
 """Least sigma of learned slip: the next ground may be another one (assumed)."""
 GYRO_DENSITY_RADPS, WHEEL_TURN_SHARE = 3e-3, 0.1
 """Noise of the turn over seconds, beyond what a bias explains (assumed)."""
+TURN_TIME_S = 10.0
+"""Duration of a turn in one direction, over which a wrong scale adds up without fixes (assumed)."""
+NEGLIGIBLE = 0.1
+"""Share of the noise in use below which the doubt of the scale is left out."""
 ANTENNA_STATES = [NAV.stop + LINEAR.index(name) for name in ("antenna_x_m", "antenna_y_m")]
 """Of `--calibrate`, in a keyframe."""
 
@@ -117,35 +122,13 @@ class LearnedNumbers:
             self.calibration.fix(fix.t_ns, fix.enu_m, fix.horizontal_sigma_m)
         self.mounting.level.fix(fix, self._gnss.fix_noise.scale)
 
-    def keyframe(
-        self,
-        chain: Chain,
-        dt_s: float,
-        rolled_m: float | None,
-        course_rad: float,
-        gyro_radps: Array,
-        accel_mps2: Array,
-    ) -> None:
-        """Take the motion of `dt_s` up to the newest keyframe.
-
-        Args:
-            rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
-            course_rad: of the wheels, as steered, from the body's x axis.
-            gyro_radps, accel_mps2: (3,) mean readings, corrected.
-        """
+    def keyframe(self, chain: Chain, mean: MeanMotion) -> None:
+        """Take the motion up to the newest keyframe."""
         if self.calibration is not None:
-            turn_rad = float(gyro_radps[2]) * dt_s
-            self._drive(self.calibration, chain, rolled_m, turn_rad, course_rad)
-        self.mounting.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
+            self._drive(self.calibration, chain, mean)
+        self.mounting.keyframe(chain, mean)
 
-    def _drive(
-        self,
-        learning: SelfCalibration,
-        chain: Chain,
-        rolled_m: float | None,
-        turn_rad: float,
-        course_rad: float,
-    ) -> None:
+    def _drive(self, learning: SelfCalibration, chain: Chain, mean: MeanMotion) -> None:
         if self._gnss.local:
             learning.restart()
             return
@@ -154,9 +137,10 @@ class LearnedNumbers:
             self._forget(self._before_skid.held or self._untouched(chain, learning))
             return
         self._handle_skid(chain, learning, skid.rate_m2ps > 0.0)
-        pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
-        t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
-        learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw(), course_rad)
+        turn_rad = float(mean.gyro_radps[2]) * mean.dt_s / (1.0 + self._imu.turn_scale)  # as measured
+        t_ns, pose = chain.nodes[-1].t_ns, chain.state(chain.last).pose
+        place, yaw_rad = np.asarray(pose.translation()), pose.rotation().yaw()
+        learning.drive(t_ns, mean.rolled_m, turn_rad, place, yaw_rad, mean.course_rad)
 
     def advance(self, chain: Chain) -> None:
         """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new
@@ -301,6 +285,21 @@ def _doubt_place(chain: Chain, moved_m: float) -> None:
     doubt = np.zeros(chain.dim)
     doubt[3:5] = moved_m**2
     chain.restart(doubt)
+
+
+def with_turn_doubt(
+    noise: SensorNoise, doubt: float, segments: list[ImuSegment], imu: ImuSpec, unaided_s: float
+) -> SensorNoise:
+    """Noise of a keyframe's yaw rate with the `doubt` of its scale, 1 sigma, `unaided_s` after the last fix.
+
+    In a steady turn at rate w an error s of the scale turns the heading by s w t; white noise of density
+    sqrt(2 t) s w gives the same variance at every t.
+    """
+    grown = math.sqrt(min(2.0 * unaided_s, TURN_TIME_S))
+    more = doubt * abs(mean_yaw_rate_radps(segments)) * grown / imu.gyro_noise_radps_sqrthz
+    if more < NEGLIGIBLE * noise.gyro_yaw_inflation:
+        return noise
+    return dataclasses.replace(noise, gyro_yaw_inflation=math.hypot(noise.gyro_yaw_inflation, more))
 
 
 def prior_of(config: EstimatorConfig) -> Knowledge:

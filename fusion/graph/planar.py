@@ -21,7 +21,7 @@ from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.preintegration import Preintegrator, combined_params
 from terrafusion.fusion.inputs.steering import SteeringStream
-from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
+from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream, mean_yaw_rate_radps
 from terrafusion.fusion.noise.policy import SensorNoise
 
 ACCEL_DENSITY_MPS2 = 2.0
@@ -120,9 +120,7 @@ class PlanarPreintegrator(Preintegrator):
 
     def params(self, segments: list[ImuSegment], noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
         """Noise of the segments; of `noise` only the inflation about yaw acts."""
-        turned = sum(float(segment.gyro_radps[2]) * segment.dt_s for segment in segments)
-        total = sum(segment.dt_s for segment in segments)
-        yaw = self.yaw_density(turned / total if total > 0.0 else 0.0, noise.gyro_yaw_inflation)
+        yaw = self.yaw_density(mean_yaw_rate_radps(segments), noise.gyro_yaw_inflation)
         forward = segments[0].accel_density_mps2 if segments else None
         walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw in BIASED else _BIAS_WALK
         return combined_params(

@@ -43,6 +43,13 @@ class ImuSegment:
     accel_density_mps2: tuple[float, float] | None = None
 
 
+def mean_yaw_rate_radps(segments: list[ImuSegment]) -> float:
+    """Mean angular rate about z over the segments; 0 without any."""
+    total_s = sum([segment.dt_s for segment in segments])
+    turn_rad = sum([float(segment.gyro_radps[2]) * segment.dt_s for segment in segments])
+    return turn_rad / total_s if total_s > 0.0 else 0.0
+
+
 SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
 """Beyond these, on any axis, a sample is a spike (assumed): a shock lasts for less than a sample, and taken
 for all of it, at 100 Hz, it is half a metre a second."""

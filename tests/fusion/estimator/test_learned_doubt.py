@@ -25,8 +25,7 @@ from terrafusion.fusion.calibration.numbers import (
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.before_skid import SKID_DETECTION_NS, KnownBeforeSkid
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.learned_numbers import _doubt_place
-from terrafusion.fusion.estimator.turn_doubt import TURN_TIME_S, with_turn_doubt
+from terrafusion.fusion.estimator.learned_numbers import TURN_TIME_S, _doubt_place, with_turn_doubt
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
