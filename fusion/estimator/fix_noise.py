@@ -15,6 +15,7 @@ from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
+from terrafusion.fusion.weighting.weighting import white_variance
 
 LEAST_SIGMA_M = 0.005
 KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
@@ -94,7 +95,7 @@ class FixNoise:
         share = (by_report if fixed else 1.0) * scale
         *level, up = (fix.sigma_m * inflation).tolist()
         drift_m2 = (share * self.drift.sigma_m) ** 2
-        white = [math.sqrt(max(sigma**2 - drift_m2, self.white * sigma**2)) for sigma in level]
+        white = [math.sqrt(white_variance(sigma**2, drift_m2, self.white)) for sigma in level]
         return np.maximum([*white, up * self._height_factor], LEAST_SIGMA_M), share
 
     def test_wheels(self, chain: Chain, skid: SkidDetector, noise: SensorNoise) -> None:

@@ -134,12 +134,9 @@ def heading_from_motion(
     heights = np.array([f.enu_m[2] for f in inside])
     height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
     stuck, shown = abs(turn) < LEAST_RATIO * information, max(abs(turn), LEAST_RATIO * information)
-    by_numbers = (pull @ path.by_numbers(t_fix)).imag / shown
-    by_delay = _turned_by_delay(path, pull, t_fix, float(np.sqrt(doubt.numbers[GNSS_DELAY, GNSS_DELAY])))
     # Fixes that move further than the wheels do not show the heading better.
     random = UNKNOWN_YAW_RAD if stuck else off * variance**0.5 / min(shown, information)
-    sigma_rad = float(np.sqrt(random**2 + by_delay**2 + by_numbers @ doubt.numbers @ by_numbers))
-    sigma_rad = min(sigma_rad, UNKNOWN_YAW_RAD)
+    sigma_rad = _yaw_sigma(path, pull, t_fix, shown, random, doubt.numbers)
     mean_m = off * np.sqrt(max(mean_variance, float(((mean_of * sigma_m) ** 2).sum())))
     start = dataclasses.replace(
         level,
@@ -149,6 +146,16 @@ def heading_from_motion(
         yaw_sigma_rad=sigma_rad,
     )
     return MotionStart(start, random, float(np.hypot(mean_m, sigma_rad * abs(mean_of @ z))))
+
+
+def _yaw_sigma(
+    path: AntennaPath, pull: Complex, t_s: Array, shown: float, random_rad: float, numbers: Array
+) -> float:
+    """1 sigma of the heading, rad: `random_rad`, and what delay and numbers (8, 8) turn the path by."""
+    by_numbers = (pull @ path.by_numbers(t_s)).imag / shown
+    by_delay = _turned_by_delay(path, pull, t_s, float(np.sqrt(numbers[GNSS_DELAY, GNSS_DELAY])))
+    sigma_rad = float(np.sqrt(random_rad**2 + by_delay**2 + by_numbers @ numbers @ by_numbers))
+    return min(sigma_rad, UNKNOWN_YAW_RAD)
 
 
 def _weights(z: Complex, t_s: Array, sigma_m: Array, doubt: MotionDoubt) -> tuple[Array, float, Complex]:

@@ -29,6 +29,7 @@ from terrafusion.fusion.estimator.alignment import WINDOW_NS, Start
 from terrafusion.fusion.estimator.slow_bias import BiasedSensor, SlowBias
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, yaw_of
+from terrafusion.fusion.inputs.streams import axes_turned
 
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
 """For a vehicle whose file has no magnetometer (assumed: calibrated once)."""
@@ -70,8 +71,7 @@ def heading_factor(k: int, R: Array, turn_rad: float, sigma_rad: float) -> gtsam
     A horizontal direction of the world, seen from the turned body. The error's second part is its vertical
     one (GTSAM's basis of a horizontal unit vector), left free.
     """
-    c, s = math.cos(turn_rad), math.sin(turn_rad)
-    seen = R.T @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ _NORTH_EAST)
+    seen = R.T @ (axes_turned(turn_rad) @ _NORTH_EAST)
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, FREE_SIGMA]))
     return gtsam.AttitudeFactorPose3(X(k), gtsam.Unit3(_NORTH_EAST), noise, gtsam.Unit3(seen))
 
@@ -83,9 +83,7 @@ def wrapped(angle_rad: float) -> float:
 
 def levelled(R: Array) -> Array:
     """The rotation without its heading: body to a level frame along the robot."""
-    yaw = yaw_of(R)
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
+    return axes_turned(yaw_of(R)) @ R
 
 
 class FieldReference:

@@ -250,8 +250,13 @@ class ImuStream(SampleStream):
 
 def turned(vectors: Array, angle_rad: float) -> Array:
     """Vectors (..., 3) turned about z."""
+    return np.asarray(vectors @ axes_turned(angle_rad))
+
+
+def axes_turned(angle_rad: float) -> Array:
+    """The matrix (3, 3) to axes that are turned about z by an angle."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
-    return np.asarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 class WheelStream(SampleStream):

@@ -31,6 +31,7 @@ from terrafusion.fusion.weighting.weighting import (
     NoiseInForce,
     Weighting,
     inflated,
+    white_variance,
 )
 
 FIXED_POINT_STEPS = 4
@@ -118,7 +119,7 @@ class InnovationWeighting(Weighting):
         white = float(np.mean(test.noise_m2)) / unit2
         drift = test.drift_m2 / unit2
         least = test.white_share
-        low, high = (_white(x**2, drift, least) for x in (self._low, self._high))
+        low, high = (white_variance(x**2, drift, least) for x in (self._low, self._high))
         if not self._gnss_seen:
             self._gnss.start(white)
             self._gnss_seen = True
@@ -127,7 +128,7 @@ class InnovationWeighting(Weighting):
         inflation = math.sqrt(min(self._gnss.value + drift, self._gnss.value / least))
         self._set(test.t_ns, "gnss", "gnss_inflation", min(max(inflation, self._low), self._high), "")
         now = self._noise.noise.gnss_inflation
-        return math.sqrt(_white(now**2, drift, least) / _white(before**2, drift, least)), 1.0
+        return math.sqrt(white_variance(now**2, drift, least) / white_variance(before**2, drift, least)), 1.0
 
     def _set(self, t_ns: int, sensor: str, name: str, value: float, unit: str) -> None:
         self._noise.noise = dataclasses.replace(self._noise.noise, **{name: value})
@@ -136,8 +137,3 @@ class InnovationWeighting(Weighting):
             why = f"{name}: innovations ({self.method})"
             self._noise.record(WeightChange(t_ns, sensor, before, value, unit, why))
             self._recorded[name] = value
-
-
-def _white(reported: float, drift: float, least: float) -> float:
-    """Variance that is white in every fix, of a `reported` one with `drift` in it, as in `GnssUpdater`."""
-    return max(reported - drift, least * reported)

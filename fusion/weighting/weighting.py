@@ -80,6 +80,11 @@ def wheel_innovation_test(
     )
 
 
+def white_variance(reported: float, drift: float, least_share: float) -> float:
+    """White variance of a fix: the `reported` one less that of the `drift`, at least a share of it."""
+    return max(reported - drift, least_share * reported)
+
+
 def inflated(wheels: WheelIncrement, scale: float) -> WheelIncrement:
     """The increment with `scale` times the sigma along body x."""
     return dataclasses.replace(wheels, sigma=wheels.sigma * np.array([scale, 1.0, 1.0, 1.0]))
