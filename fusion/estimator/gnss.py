@@ -160,23 +160,12 @@ class GnssUpdater:
             if k is None:
                 self.too_late += 1
             elif self.local:
-                self.unaligned += 1
-                self.track.add(fix)
-                self._local_fixes += [fix] if chain.archive is not None else []
-                gave_place = self.open_heading is not None and fix.t_ns <= self.open_heading.until_ns
-                used |= not gave_place and self._align(chain, fix, noise)
+                used |= self._use_local(chain, fix, noise)
             elif self._implausible(chain, k, fix):
                 self.rejected += 1
             else:
-                if self._pair is not None:
-                    self.track.keep(self._pair)
-                self.fix_noise.learn(self.track.scatter(), self.track.white_share())
-                if self.fix_noise.scale > OPTIMISTIC_SCATTER * self._applied_scale:
-                    self._doubt_used(chain, fix)
-                if self.skid.friction is not None:
-                    self.skid.friction.score_fix(fix, self.fix_noise.scale)
-                restarted = self._change_class(chain, k, fix)
-                if restarted or used or k < chain.last:
+                self._learn_noise(chain, fix)
+                if self._change_class(chain, k, fix) or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                 used |= self._add_fix(chain, k, fix, noise)
                 if self._within_reach:
@@ -185,6 +174,24 @@ class GnssUpdater:
         if used:
             self.weighting.revisit(chain)
         return used
+
+    def _use_local(self, chain: Chain, fix: GnssFix, noise: SensorNoise) -> bool:
+        """Use a fix while the path is local: it may align it with the map, unless it gave its place."""
+        self.unaligned += 1
+        self.track.add(fix)
+        self._local_fixes += [fix] if chain.archive is not None else []
+        gave_place = self.open_heading is not None and fix.t_ns <= self.open_heading.until_ns
+        return not gave_place and self._align(chain, fix, noise)
+
+    def _learn_noise(self, chain: Chain, fix: GnssFix) -> None:
+        """What the newest fix shows of the noise of fixes, and of friction."""
+        if self._pair is not None:
+            self.track.keep(self._pair)
+        self.fix_noise.learn(self.track.scatter(), self.track.white_share())
+        if self.fix_noise.scale > OPTIMISTIC_SCATTER * self._applied_scale:
+            self._doubt_used(chain, fix)
+        if self.skid.friction is not None:
+            self.skid.friction.score_fix(fix, self.fix_noise.scale)
 
     def _implausible(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Whether a fix must not be used whatever the gate says of it."""
