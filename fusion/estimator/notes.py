@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from terrafusion.datasets.core.printable import counted, times
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.inputs.time_jumps import JUMP_NS
 from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
@@ -11,7 +12,17 @@ from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
-    gnss, notes = estimator.gnss, []
+    notes = _on_fixes(estimator.gnss)
+    if found := estimator.weights.found_grounds():
+        notes.append("grounds found while driving, with their slip: " + ", ".join(found))
+    if level := estimator.learned.mounting.level.note():
+        notes.append(level)
+    return (*notes, *_on_samples(estimator), *_on_times(estimator), *estimator.aids.notes())
+
+
+def _on_fixes(gnss: GnssUpdater) -> list[str]:
+    """Fixes, and what they showed of heading and skids."""
+    notes = []
     if gnss.open_heading is not None:
         then = "later fixes showed it" if gnss.alignment is not None else "no later fixes showed it"
         notes.append(
@@ -37,10 +48,12 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot skidded, with a friction limit of {friction.mps2:.1f} m/s2")
-    if found := estimator.weights.found_grounds():
-        notes.append("grounds found while driving, with their slip: " + ", ".join(found))
-    if level := estimator.learned.mounting.level.note():
-        notes.append(level)
+    return notes
+
+
+def _on_samples(estimator: Estimator) -> list[str]:
+    """Samples of IMU and wheels that were replaced or left out."""
+    notes = []
     if estimator.imu.spikes:
         notes.append(
             f"{counted(estimator.imu.spikes, 'IMU sample')} beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} "
@@ -64,6 +77,12 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             f"the gyro's yaw rate stood still for {counted(estimator.gyro.samples, 'sample')} while the "
             "wheels turned otherwise: the wheels stood in for it"
         )
+    return notes
+
+
+def _on_times(estimator: Estimator) -> list[str]:
+    """Samples that came too late or were stamped far ahead."""
+    notes = []
     for channel, ahead in estimator.newest.refused.items():
         notes.append(f"{counted(ahead, 'sample')} of {channel} left out: far ahead of IMU and wheels")
     if dropped := estimator.fixes.dropped:
@@ -80,4 +99,4 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         if stream.too_late:
             late = counted(stream.too_late, "sample")
             notes.append(f"{late} of {stream.channel} came too late, with the keyframe made")
-    return (*notes, *estimator.aids.notes())
+    return notes
