@@ -71,6 +71,6 @@ def back_substitute_before(conditionals: Iterable[Array], following: Array) -> l
 def covariance_before(conditional: Array, following: Array) -> Array:
     """Marginal covariance (d, d) of a state from that of the one after it, and `eliminated`'s first rows."""
     dim = len(conditional)
-    inverse, _ = lapack.dtrtri(conditional[:, :dim])
+    inverse, _ = lapack.dtrtri(conditional[:, :dim] * _UPPER[:dim, :dim])
     gain = inverse @ conditional[:, dim : 2 * dim]
     return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

@@ -17,6 +17,7 @@ from terrafusion.fusion.graph.gauss_markov import markov_step
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.node import Node
+from terrafusion.fusion.graph.triangular import covariance_before, eliminated
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from tests import gtsam_factors
@@ -399,3 +400,12 @@ def test_an_undetermined_chain_says_so() -> None:
     chain.append(0, points[0])
     with pytest.raises(ArithmeticError, match="not determined"):
         chain.solve(1)
+
+
+def test_the_covariance_of_an_eliminated_state_is_that_of_the_whole() -> None:
+    rng, d = np.random.default_rng(3), 4
+    known, rest = rng.normal(size=(d, d + 1)), rng.normal(size=(8, 2 * d + 1))  # no triangle
+    both = np.vstack([np.hstack([known[:, :d], np.zeros((d, d))]), rest[:, :-1]])
+    whole = np.linalg.inv(both.T @ both)
+    conditional, _ = eliminated(np.asfortranarray(np.vstack([np.zeros((d, 2 * d + 1)), rest])), known)
+    np.testing.assert_allclose(covariance_before(conditional, whole[d:, d:]), whole[:d, :d], rtol=1e-9)
