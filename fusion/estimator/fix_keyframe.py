@@ -1,20 +1,16 @@
-"""The keyframe of a fix, the motion of the antenna between both, and cutting the past off."""
+"""The keyframe of a fix, and the motion of the antenna between both."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.fusion.estimator.gates import GateDecision
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever
 from terrafusion.fusion.graph.key_state import ANTENNA, GNSS_DELAY, cross
 from terrafusion.fusion.inputs.validation import GnssFix
 
-LARGE_TURN_RAD = 0.05
 APART_NS = 1_000_000_000
 """Keyframes are closer than this; a fix farther from the next one came in a pause of the IMU."""
 
@@ -57,34 +53,6 @@ class AntennaMotion:
         lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - antenna_m)
         velocity = state.velocity + accel_world * offset_s + R @ cross(rate, antenna)
         return cls(offset_s, delay_s, R, rate, accel_world, antenna, lever, velocity)
-
-
-def cut_past(
-    chain: Chain,
-    k: int,
-    covariance: Array,
-    innovation_m: Array,
-    S: Array,
-    jacobian: Array,
-    verdict: GateDecision,
-) -> bool:
-    """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
-
-    A fix after a long outage can turn the heading by more than the window's linearisation bears;
-    applied to its keyframe alone it is a Kalman update, which cannot diverge.
-    """
-    doubt = np.zeros(chain.dim)
-    if verdict is GateDecision.REACQUIRE:
-        doubt[3:6] = float(innovation_m @ innovation_m)
-    else:
-        (a, b), (c, d) = S.tolist()
-        x, y = innovation_m.tolist()
-        solved = np.array([d * x - b * y, a * y - c * x]) / (a * d - b * c)
-        turn = covariance[:3] @ (jacobian.T @ solved)
-        if max(map(abs, turn.tolist())) < LARGE_TURN_RAD:
-            return False
-    chain.restart(doubt, k)
-    return True
 
 
 def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:

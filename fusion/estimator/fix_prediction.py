@@ -10,12 +10,14 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion
+from terrafusion.fusion.estimator.gates import GateDecision
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
 from terrafusion.fusion.graph.key_state import NAV, POSE, VELOCITY, KeyState
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.weighting.weighting import InnovationTest
 
+LARGE_TURN_RAD = 0.05
 UNKNOWN_HEIGHT_SIGMA_M = 1e6
 """1 sigma of an unknown height: even many such fixes must not determine it."""
 
@@ -89,6 +91,26 @@ class PredictedFix:
         sigma = sigma * np.array([scale, scale, 1.0])
         position = dataclasses.replace(self.position, sigma_m=sigma, weight=weight)
         return dataclasses.replace(self, position=position, S_m2=S_m2)
+
+
+def cut_past(chain: Chain, used: PredictedFix, verdict: GateDecision) -> bool:
+    """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
+
+    A fix after a long outage can turn the heading by more than the window's linearisation bears;
+    applied to its keyframe alone it is a Kalman update, which cannot diverge.
+    """
+    doubt, innovation_m = np.zeros(chain.dim), used.innovation_m[:2]
+    if verdict is GateDecision.REACQUIRE:
+        doubt[3:6] = float(innovation_m @ innovation_m)
+    else:
+        (a, b), (c, d) = used.S_m2.tolist()
+        x, y = innovation_m.tolist()
+        solved = np.array([d * x - b * y, a * y - c * x]) / (a * d - b * c)
+        turn = used.covariance[:3] @ (used.jacobian[:2].T @ solved)
+        if max(map(abs, turn.tolist())) < LARGE_TURN_RAD:
+            return False
+    chain.restart(doubt, used.k)
+    return True
 
 
 def without_height(fix: GnssPosition, state: KeyState) -> GnssPosition:

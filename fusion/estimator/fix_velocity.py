@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion
+from terrafusion.fusion.estimator.fix_prediction import PredictedFix
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import GNSS_DELAY, VELOCITY, cross
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
@@ -27,22 +27,15 @@ class FixVelocities:
     refused: int = 0
 
     def factor(
-        self,
-        chain: Chain,
-        fix: GnssFix,
-        at: AntennaMotion,
-        antenna_m: Array,
-        covariance: Array,
-        inflation: float,
+        self, chain: Chain, used: PredictedFix, antenna_m: Array, inflation: float
     ) -> GnssVelocity | None:
         """The factor of a fix, None where it has no usable velocity.
 
         Args:
-            at: the antenna's motion by the estimate at the fix.
             antenna_m: lever arm (3,), body, without what the chain estimates of it.
-            covariance: (dim, dim) of the keyframe's tangent.
             inflation: of the reported sigma.
         """
+        fix, at, covariance = used.fix, used.motion, used.covariance
         measured_mps = self._usable(fix, at.velocity_mps, covariance)
         if measured_mps is None:
             return None

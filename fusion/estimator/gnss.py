@@ -16,9 +16,9 @@ from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.alignment import KnownStart
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.drift_watch import LEAST_SHARE
-from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
+from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, keyframe_of
 from terrafusion.fusion.estimator.fix_noise import OPTIMISTIC_SCATTER, FixNoise
-from terrafusion.fusion.estimator.fix_prediction import PredictedFix, without_height
+from terrafusion.fusion.estimator.fix_prediction import PredictedFix, cut_past, without_height
 from terrafusion.fusion.estimator.fix_velocity import FixVelocities
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map, turn_window
@@ -337,21 +337,21 @@ class GnssUpdater:
 
     def _add_factors(self, chain: Chain, used: PredictedFix, verdict: GateDecision, inflation: float) -> None:
         """Position, with its height where its gate accepts it, and velocity of a fix."""
-        k, fix, position, off_m, P = used.k, used.fix, used.position, used.innovation_m, used.covariance
-        cut = cut_past(chain, k, P, off_m[:2], used.S_m2, used.jacobian[:2], verdict)
+        k, position, off_m = used.k, used.position, used.innovation_m
+        cut = cut_past(chain, used, verdict)
         known = math.isfinite(off_m[2] + position.sigma_m[2])
         if known:
             gated, _ = self.height_gate.test(off_m[2:], used.predicted_m2[2:, 2:] + position.sigma_m[2] ** 2)
             known = gated is not GateDecision.REJECT
         chain.add_fix(k, position if known else without_height(position, used.state))
-        velocity = self.velocities.factor(chain, fix, used.motion, self.antenna_m, P, inflation)
+        velocity = self.velocities.factor(chain, used, self.antenna_m, inflation)
         if velocity is not None:
             chain.add_velocity(k, velocity)
         if cut:
             chain.smooth(chain.last - k + 1)
             chain.restart(np.zeros(chain.dim), k)
         if position.weight > UNUSED_WEIGHT:
-            self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
+            self.last_used_ns = max(used.fix.t_ns, self.last_used_ns or used.fix.t_ns)
 
     @property
     def _within_reach(self) -> bool:
