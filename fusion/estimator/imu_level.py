@@ -36,13 +36,6 @@ UP_OVER_LEVEL = 1.5
 """Least sigma of a height over that of its place (assumed: geometry of satellites)."""
 
 
-def level_rotation(roll_rad: float, pitch_rad: float) -> Array | None:
-    """Rotation (3, 3) of the readings of a tilted IMU into body axes, but for yaw; None for a level one."""
-    if roll_rad == pitch_rad == 0.0:
-        return None
-    return np.asarray(gtsam.Rot3.RzRyRx(roll_rad, pitch_rad, 0.0).matrix())
-
-
 class ImuLevel:
     """Learns roll and pitch of the IMU, and levels its samples.
 
@@ -72,8 +65,7 @@ class ImuLevel:
         self._level()
 
     def _level(self) -> None:
-        roll, pitch = (angle.rad for angle in self.known)
-        self._imu.level = level_rotation(roll, pitch) if self._six_axis else None
+        self._imu.level = _rotation(self.known) if self._six_axis and any(self._angles()) else None
 
     def hold(self, known: tuple[Angle, Angle], corrects: list[bool]) -> None:
         """Use what an earlier pass over the same samples gave, and learn no more of them."""
@@ -182,7 +174,6 @@ class ImuLevel:
 
 
 def _rotation(level: tuple[Angle, Angle]) -> Array:
-    """As `level_rotation`, of the angles in use."""
+    """Rotation (3, 3) of the readings of an IMU tilted by roll and pitch into body axes, but for yaw."""
     roll, pitch = level
-    rotation = level_rotation(roll.rad, pitch.rad)
-    return np.eye(3) if rotation is None else rotation
+    return np.asarray(gtsam.Rot3.RzRyRx(roll.rad, pitch.rad, 0.0).matrix())

@@ -5,6 +5,7 @@ no ground explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and 
 that came to look alike are merged.
 """
 
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -155,7 +156,7 @@ class GroundMemory:
         found: dict[str, Ground] = {}
         for ground in self.grounds:
             name = names.get(ground.name, ground.name)
-            other = Ground(**{**vars(ground), "name": name})
+            other = dataclasses.replace(ground, name=name)
             found[name] = found[name].merged(other) if name in found else other
         return GroundMemory(list(found.values()), self.robot)
 
@@ -183,7 +184,7 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
             while name in names and name.startswith("ground "):
                 name, i = f"ground {i}", i + 1
             names.add(name)
-            grounds.append(Ground(**{**vars(ground), "name": name}))
+            grounds.append(dataclasses.replace(ground, name=name))
     return GroundMemory(grounds, next((m.robot for m in found if m.robot), "")).named({}).condensed()
 
 

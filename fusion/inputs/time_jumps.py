@@ -5,6 +5,7 @@ decide between a pause and a wrong clock.
 """
 
 import itertools
+import statistics
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -29,8 +30,8 @@ LONGEST_REFUTED_NS = 5_000_000_000
 
 def median_step_ns(times: Iterable[int]) -> int:
     """Median of the steps between times, ns, the upper one of two; 0 with fewer than three times."""
-    steps = sorted(b - a for a, b in itertools.pairwise(times))
-    return steps[len(steps) // 2] if len(steps) > 1 else 0
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    return statistics.median_high(steps) if len(steps) > 1 else 0
 
 
 @dataclass

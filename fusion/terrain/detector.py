@@ -11,9 +11,6 @@ from terrafusion.fusion.terrain.credit import SourceCredit
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.terrain.sequence import PatchFilter
 
-__all__ = ["TerrainDetector", "Window"]
-
-
 EXTERNAL_TRUST = 0.3
 """Exponent on the evidence of an external source: its frames repeat one another as windows do."""
 EXTERNAL_ERROR = 0.1

@@ -18,8 +18,8 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import as_numbers
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 from terrafusion.fusion.terrain.classifier import FOREIGN_SLIP, UNKNOWN, load_terrain_model
-from terrafusion.fusion.terrain.detector import TerrainDetector, Window
-from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, slip_without_prior
+from terrafusion.fusion.terrain.detector import TerrainDetector
+from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, slip_without_prior
 from terrafusion.fusion.weighting.driven_slip import DrivenSlip
 from terrafusion.fusion.weighting.ground_slip import GroundSlip
 from terrafusion.fusion.weighting.innovation import InnovationWeighting

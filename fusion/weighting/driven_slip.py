@@ -43,14 +43,6 @@ class SlipPrior:
     between: Array
     time_s: Array
 
-    @classmethod
-    def of_policy(cls, policy: Policy) -> "SlipPrior":
-        """Of the classes of a policy; what looks like one of them may be another ground."""
-        mean, sigma, _, time_s = policy.slips()
-        return cls(
-            mean, sigma, math.sqrt(WITHIN) * sigma, np.full(len(mean), policy.fixed.slip_sigma), time_s
-        )
-
 
 class DrivenSlip:
     """Time, mean and scatter of the slip on each of k grounds, on the level.
@@ -68,8 +60,10 @@ class DrivenSlip:
 
     @classmethod
     def of_policy(cls, policy: Policy) -> "DrivenSlip":
-        """Of the classes of a policy."""
-        return cls(SlipPrior.of_policy(policy), policy.slips()[2])
+        """Of the classes of a policy; what looks like one of them may be another ground."""
+        mean, sigma, per_grade, time_s = policy.slips()
+        between = np.full(len(mean), policy.fixed.slip_sigma)
+        return cls(SlipPrior(mean, sigma, math.sqrt(WITHIN) * sigma, between, time_s), per_grade)
 
     def add(self, probabilities: Array, slip: float, sigma: float, grade: float, dt_s: float) -> None:
         """One window: class probabilities (k,), slip by the measurements alone with its 1 sigma, grade.
