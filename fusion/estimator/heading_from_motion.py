@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import itertools
 from dataclasses import dataclass
@@ -105,8 +106,8 @@ def heading_from_motion(
         the start. Where the fixes hardly move though the wheels do, the heading is unknown. None with fewer
         than three fixes, or while neither has moved.
     """
-    times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
-    inside = [f for f in fixes if len(times) and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
+    times = wheels.t_ns[bisect.bisect_left(wheels.t_ns, level.t_ns) :]
+    inside = [f for f in fixes if times and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
     if len(inside) < 3 or len(times) < 3:
         return None
     t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
@@ -239,13 +240,13 @@ def _antenna_path(
     """
     t_imu, gyro, _ = imu.window(level.t_ns, imu.t_ns[-1] + 1)
     measured = np.concatenate([[0.0], np.cumsum(gyro[1:, 2] * np.diff(t_imu))])
-    index = [i for i, t in enumerate(wheels.t_ns) if t >= level.t_ns]
-    t_s = np.array([wheels.t_ns[i] - level.t_ns for i in index], dtype=float) * 1e-9
-    distance = np.array([0.5 * (wheels.left_m[i] + wheels.right_m[i]) for i in index])
+    begin = bisect.bisect_left(wheels.t_ns, level.t_ns)
+    t_ns = wheels.t_ns[begin:]
+    t_s = np.array([t - level.t_ns for t in t_ns], dtype=float) * 1e-9
+    distance = 0.5 * (np.array(wheels.left_m[begin:]) + np.array(wheels.right_m[begin:]))
     turns = np.diff(np.interp(t_s, t_imu, measured))
     ahead, course = np.diff(distance), None
     if steering is not None and steering.t_ns:
-        t_ns = [wheels.t_ns[i] for i in index]
         course = np.array([steering.course_rad(a, b) for a, b in itertools.pairwise(t_ns)])
         ahead = ahead * np.cos(course)
     drive = MotionSegment(t_s, ahead, turns, course_rad=course)

@@ -89,7 +89,6 @@ class LearnedNumbers:
         self._imu, self._gnss, self._weights = imu, gnss, weights
         self.mounting = ImuMounting(config, imu, gnss.skid)
         self._spec = config.rig.sensors.imu
-        self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._known, self._skids = prior, config.rig.drive in SKIDDING
         self._antenna_assumed = known.antenna_m is not None and known.antenna_m.known == "assumed"
         self._rule, self._before_skid = CorrectionRule(prior, self._skids), KnownBeforeSkid()
@@ -102,18 +101,17 @@ class LearnedNumbers:
         if self.calibration is not None:
             self.calibration.start_from(prior)
             self._known, self._rule = prior, CorrectionRule(prior, self._skids)
-            self._bias_radps = float(prior.mean[GYRO_BIAS])
             self._apply(prior, 0)
 
     def with_known(self, point: KeyState, sigmas: Array, start: Start) -> tuple[KeyState, Array]:
         """The first state and its 1 sigmas (DIM,), with what is known: the gyro's bias of earlier
         runs where the robot did not stand to show it, and how well the antenna's place is known.
         """
-        known = sigmas.copy()
-        known[ANTENNA_STATES] = self._rule.before.sigma[[ANTENNA_X, ANTENNA_Y]]
-        if start.gyro_bias_radps is not None or self._bias_radps == 0.0:
+        known, before = sigmas.copy(), self._rule.before
+        known[ANTENNA_STATES] = before.sigma[[ANTENNA_X, ANTENNA_Y]]
+        if start.gyro_bias_radps is not None or before.mean[GYRO_BIAS] == 0.0:
             return point, known
-        gyro = np.array([0.0, 0.0, self._bias_radps])
+        gyro = np.array([0.0, 0.0, before.mean[GYRO_BIAS]])
         return dataclasses.replace(point, bias=gtsam.imuBias.ConstantBias(np.zeros(3), gyro)), known
 
     def fix(self, fix: GnssFix) -> None:
@@ -167,7 +165,7 @@ class LearnedNumbers:
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
         """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
-        numbers = [] if self.calibration is None else self._of_fixes(self.calibration.prior)
+        numbers = [] if self.calibration is None else self._of_fixes(self._rule.before)
         if self.mounting.learns:
             angle, before = self.mounting.known, self.mounting.before
             sigmas = angle.sigma_rad, before.sigma_rad

@@ -203,10 +203,12 @@ class ImuStream(SampleStream):
         return segments
 
     def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
+        """Readings (..., 3) by body axes; without `six_axis` the yaw rate alone, on level ground."""
         if self.six_axis:
             return self._corrected(gyro, accel)
-        yaw_rate = (1.0 + self.turn_scale) * gyro[2]
-        return np.array([0.0, 0.0, yaw_rate]), np.array([0.0, 0.0, GRAVITY_MPS2])
+        rate, force = np.zeros(gyro.shape), np.zeros(gyro.shape)
+        rate[..., 2], force[..., 2] = (1.0 + self.turn_scale) * gyro[..., 2], GRAVITY_MPS2
+        return rate, force
 
     def _corrected(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
         """Readings (..., 3) by body axes, with their turns as they are."""
@@ -220,12 +222,8 @@ class ImuStream(SampleStream):
 
     def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
-        _, gyro, accel = self.window(start_ns, end_ns)
-        if self.six_axis:
-            return gyro, accel
-        yaw_rate = np.zeros(gyro.shape)
-        yaw_rate[:, 2] = gyro[:, 2]
-        return yaw_rate, np.tile([0.0, 0.0, GRAVITY_MPS2], (len(gyro), 1))
+        _, *readings = self._measured(start_ns, end_ns)
+        return self._for_graph(*readings)
 
     def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
         """Longest time between samples that touch the interval, s."""
@@ -236,10 +234,15 @@ class ImuStream(SampleStream):
 
     def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
         """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end, body axes."""
+        times, *readings = self._measured(start_ns, end_ns)
+        t_s = np.array([t_ns - start_ns for t_ns in times], dtype=float) * 1e-9
+        return t_s, *self._corrected(*readings)
+
+    def _measured(self, start_ns: int, end_ns: int) -> tuple[list[int], Array, Array]:
+        """Times (n,) ns, and readings (n, 3) as measured, with start <= t < end."""
         i, j = bisect.bisect_left(self.t_ns, start_ns), bisect.bisect_left(self.t_ns, end_ns)
-        t = np.array([x - start_ns for x in self.t_ns[i:j]], dtype=float) * 1e-9
         gyro, accel = (np.array(held[i:j]).reshape(-1, 3) for held in (self.gyro, self.accel))
-        return t, *self._corrected(gyro, accel)
+        return self.t_ns[i:j], gyro, accel
 
     def forget(self, before_ns: int) -> None:
         super().forget(before_ns)
