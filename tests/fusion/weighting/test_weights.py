@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -270,8 +271,11 @@ class Window:
         assert 0 <= k - self.first < len(self.nodes)
         return KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(15))
 
+    def node(self, k: int) -> Any:
+        return self.nodes[k - self.first]
+
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
-        node = self.nodes[k - self.first]
+        node = self.node(k)
         node.fixes = [new if fix is old else fix for fix in node.fixes]
 
     def weights(self) -> list[float]:
