@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -290,8 +289,15 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
         yield lambda share: bar.update(task, completed=share)
 
 
-PROGRESS = SimpleNamespace(bar=True, lines=False)
-"""Whether progress is shown: as a bar on a terminal, as lines in a pipe."""
+@dataclass
+class ProgressOptions:
+    """Whether progress is shown: as a bar on a terminal, as lines in a pipe."""
+
+    bar: bool = True
+    lines: bool = False
+
+
+PROGRESS = ProgressOptions()
 LINE_EVERY_S = 5.0
 
 
