@@ -27,7 +27,9 @@ FUNCTIONS = ("speed", "abs_turn", "turn_rate", "acceleration")
 DISCREPANCY = 0.1  # 1 sigma of the coefficient of each (assumed: together about a quarter of the signature)
 ROUNDS, SAME = 4, 0.03
 """Most fits of laws, each with the discrepancy of the sizes before, and by what share these may differ."""
-LEFT = 0.5  # most that a second law may leave of the excess that the first leaves
+LEFT = 0.5
+"""Most that a second law may leave of the excess that the first leaves (assumed, with one robot of another
+simulator in view)."""
 PAIRS, FIRST = 30, 5
 """Pairs that are fitted: the best to first sight, and all of the best laws."""
 
