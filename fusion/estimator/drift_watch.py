@@ -125,7 +125,7 @@ class DriftWatch:
         if moved is None or P[2, 2] > MOST_YAW_RAD**2:
             return
         since_ns, moved_m = moved
-        if skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise):
+        if skid.test_wheels(chain, chain.last, since_ns, [moved_m, moved_m], sigma_m, noise, rejected=False):
             self.restart()
 
     def moved_too_far(self, now: DriftEstimate) -> tuple[int, Array] | None:

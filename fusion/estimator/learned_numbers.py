@@ -134,7 +134,8 @@ class LearnedNumbers:
         if skid.friction is not None and skid.friction.leads:
             self._forget(self._before_skid.held or self._untouched(chain, learning))
             return
-        self._handle_skid(chain, learning, skid.rate_m2ps > 0.0)
+        # A drift that moves too far makes a skid likely, late fixes and another antenna as well.
+        self._handle_skid(chain, learning, skid.by_rejection)
         turn_rad = float(mean.gyro_radps[2]) * mean.dt_s / (1.0 + self._imu.turn_scale)  # as measured
         t_ns, pose = chain.nodes[-1].t_ns, chain.state(chain.last).pose
         place, yaw_rad = np.asarray(pose.translation()), pose.rotation().yaw()

@@ -54,13 +54,15 @@ class SkidDetector:
         friction: friction estimator, where there is one.
         rate_m2ps: variance of the wheels' displacement, each axis, per second of driving.
         refutations: how often fixes refuted the wheels.
+        by_rejection: whether one of them, in the skid under way, was by fixes that the gate rejected.
     """
 
     def __init__(self, friction: FrictionEstimator | None = None) -> None:
         self.friction = friction
         self.rate_m2ps = 0.0
         self.refutations = 0
-        self._before: tuple[float, list[_Passed]] = (0.0, [])
+        self.by_rejection = False
+        self._before: tuple[float, bool, list[_Passed]] = (0.0, False, [])
         self._driven_s = 0.0
         self._aided_s, self._skidded_m2, self._this_skid_m2 = NO_SKID_S, 0.0, 0.0
         self._before_m = np.zeros(2)
@@ -74,6 +76,7 @@ class SkidDetector:
         refused: list[Array],
         sigma_m: float,
         noise: SensorNoise,
+        rejected: bool = True,
     ) -> bool:
         """Whether rejected fixes, the last at keyframe k, refute the wheels; doubts wheels and velocity then.
 
@@ -86,6 +89,8 @@ class SkidDetector:
             refused: offsets (2,), m, of the consecutive rejected fixes from the estimate.
             sigma_m: 1 sigma of the newest fix.
             noise: of the ground.
+            rejected: False where the gate accepted the fixes, and only the drift of the receiver, as
+                estimated, moved by `refused`.
         """
         if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
             return False
@@ -108,7 +113,9 @@ class SkidDetector:
             chain.restart(doubt, begin)
         elif more_m2ps == 0.0:
             return False
-        self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in enumerate(nodes, begin + 1)]
+        passed = [(i, n.wheels, n.link) for i, n in enumerate(nodes, begin + 1)]
+        self._before = self.rate_m2ps, self.by_rejection, passed
+        self.by_rejection |= rejected
         self.rate_m2ps += more_m2ps
         self.refutations += 1
         # Over all of the time: wheels that are locked do not say when a robot stops.
@@ -122,7 +129,7 @@ class SkidDetector:
 
     def restart(self) -> None:
         """Forget the skid: it was the heading, or the angle of the IMU, that the fixes refuted."""
-        self.rate_m2ps = 0.0
+        self.rate_m2ps, self.by_rejection = 0.0, False
         self._skidded_m2 -= self._this_skid_m2
         self._this_skid_m2 = 0.0
         if self.friction is not None:
@@ -130,7 +137,7 @@ class SkidDetector:
 
     def undo(self, chain: Chain) -> None:
         """Undo the last refutation: inflated wheels do not lead to the fix either."""
-        self.rate_m2ps, passed = self._before
+        self.rate_m2ps, self.by_rejection, passed = self._before
         self.refutations -= 1
         for i, wheels, link in passed:
             chain.revise(i, wheels=wheels, link=link)
@@ -170,7 +177,7 @@ class SkidDetector:
             rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond
             self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
         if not self.rate_m2ps:
-            self._this_skid_m2 = 0.0
+            self._this_skid_m2, self.by_rejection = 0.0, False
 
 
 def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> float:

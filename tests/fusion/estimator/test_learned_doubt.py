@@ -26,6 +26,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.before_skid import SKID_DETECTION_NS, KnownBeforeSkid
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.learned_numbers import TURN_TIME_S, _doubt_place, with_turn_doubt
+from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise, load_policy
@@ -156,6 +157,21 @@ def test_a_slide_takes_back_only_what_was_learned_since_it_began(driving: Estima
     for t_ns, known in ((now_ns - SKID_DETECTION_NS, sure), (now_ns, late)):
         learned._before_skid.learned(t_ns, known)
     assert learned._untouched(driving.chain, learned.calibration) is sure
+
+
+@pytest.mark.parametrize("by_rejection", [False, True])
+def test_learning_goes_on_where_only_the_drift_moves_as_in_a_skid(
+    driving: Estimator, monkeypatch: pytest.MonkeyPatch, by_rejection: bool
+) -> None:
+    """Late fixes look like that: learning explains them, if it is not stopped."""
+    learned, skid = driving.learned, driving.gnss.skid
+    assert learned.calibration is not None
+    monkeypatch.setattr(learned.calibration, "drive", lambda *_: None)
+    monkeypatch.setattr(learned, "_before_skid", KnownBeforeSkid())
+    monkeypatch.setattr(skid, "rate_m2ps", 0.5)
+    monkeypatch.setattr(skid, "by_rejection", by_rejection)
+    learned._drive(learned.calibration, driving.chain, MeanMotion(0.1, 0.1, 0.0, np.zeros(3), np.zeros(3)))
+    assert (learned._before_skid.held is not None) == by_rejection
 
 
 def test_learning_begins_again_from_what_was_known_before_a_wrong_heading(

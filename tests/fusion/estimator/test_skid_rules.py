@@ -115,6 +115,17 @@ def test_two_fixes_that_the_rate_explains_free_the_velocity_alone() -> None:
     assert all(call[2].sigma == pytest.approx(np.full(4, 0.01)) for call in chain.calls[1:-1])
 
 
+def test_a_skid_by_the_drift_alone_is_not_one_by_rejected_fixes() -> None:
+    slide, moved_m = SkidDetector(), [np.array([1.0, 0.0])] * 2
+    assert slide.test_wheels(Recorder(), 10, 3 * S, moved_m, 0.1, NOISE, rejected=False)  # type: ignore[arg-type]
+    assert slide.rate_m2ps > 0.0
+    assert not slide.by_rejection
+    assert refuted(Recorder(), slide, [(2.0, 0.0), (3.0, 0.0)])
+    assert slide.by_rejection
+    slide.undo(Recorder())  # type: ignore[arg-type]
+    assert not slide.by_rejection
+
+
 @pytest.mark.parametrize(("degrees", "found"), [(0.0, True), (59.0, True), (61.0, False), (180.0, False)])
 def test_the_last_two_lie_on_one_side(degrees: float, found: bool) -> None:
     angle = math.radians(degrees)
