@@ -295,8 +295,8 @@ class Chain:
     def _carry_prior(self) -> None:
         """Move the prior of the first keyframe to its estimate.
 
-        It cannot be linearised again: it stays a Gaussian in the tangent space where it was made (GTSAM's
-        LinearContainerFactor, with the derivative of the logarithm).
+        It cannot be linearised again: it stays a Gaussian in the coordinates `KeyState.local` about where it
+        was made.
         """
         node = self.nodes[0]
         if self._anchor is None or self._anchor[0] != self.first:

@@ -109,10 +109,15 @@ class KeyState:
         )
 
     def local(self, other: "KeyState") -> Array:
-        """The tangent vector (DIM,) that leads from this state to `other`."""
+        """The vector (DIM,) from this state to `other`, to first order that of `retract`.
+
+        The place is linear, in the body axes of this state: fixes know the sum of place and drift, whatever
+        the heading. In the logarithm of a pose they would seem to show a heading that is far from known.
+        """
         return np.concatenate(
             [
-                self.pose.localCoordinates(other.pose),
+                gtsam.Rot3.Logmap(self.pose.rotation().between(other.pose.rotation())),
+                self.rotation.T @ (other.pose.translation() - self.pose.translation()),
                 other.velocity - self.velocity,
                 other.bias.vector() - self.bias.vector(),
                 other.linear - self.linear,

@@ -122,9 +122,13 @@ def _fill_navigation(rows: Array, packed: Array, before: Node, node: Node) -> No
 
 
 def carried_prior(rows: Array, offset: Array) -> Array:
-    """Rows (m, dim + 1) of a prior at a state that lies `offset` from where they were made."""
+    """Rows (m, dim + 1) of a prior at a state that lies `offset` (`KeyState.local`) from where they were
+    made.
+    """
     dim = rows.shape[1] - 1
     out = rows.copy()
     out[:, dim] -= rows[:, :dim] @ offset[:dim]
-    out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
+    turn, place = slice(0, 3), slice(3, 6)
+    out[:, turn] = rows[:, turn] @ gtsam.Rot3.LogmapDerivative(offset[turn])
+    out[:, place] = rows[:, place] @ gtsam.Rot3.Expmap(offset[turn]).matrix()
     return out

@@ -15,7 +15,7 @@ from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import markov_step
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
+from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, KeyState
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import covariance_before, eliminated
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
@@ -113,7 +113,8 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
 
 def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
     diagonal = gtsam.noiseModel.Diagonal.Sigmas
-    graph.add(gtsam.PriorFactorPose3(X(0), start.pose, diagonal(SIGMAS[POSE])))
+    graph.add(gtsam.PoseRotationPrior3D(X(0), start.pose, diagonal(SIGMAS[:3])))
+    graph.add(gtsam.PoseTranslationPrior3D(X(0), start.pose, diagonal(SIGMAS[3:6])))  # equal: any axes
     graph.add(gtsam.PriorFactorVector(V(0), start.velocity, diagonal(SIGMAS[6:9])))
     graph.add(gtsam.PriorFactorConstantBias(B(0), start.bias, diagonal(SIGMAS[9:15])))
     graph.add(gtsam.PriorFactorVector(M(0), start.linear, diagonal(SIGMAS[MARKOV])))
