@@ -144,34 +144,41 @@ def make_lanes(
     return out
 
 
-def simulate_lanes(lanes: Sequence[Lane]) -> list[Array]:
-    """States (N, X) of each lane at all samples of its windows.
+def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
+    """States (N, X) of each lane at each n-th sample of its windows, see `PreparedLog.samples`.
 
     Lanes of several logs, whose soils do not change with time, run together between places where a window of
     one of them begins or ends.
     """
     fleet = _fleet(lanes)
     x, spans = _initial_states(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
-    out = [np.empty((len(lane.log.samples()), len(STATES))) for lane in lanes]
+    out = [np.empty((len(lane.log.samples(every)), len(STATES))) for lane in lanes]
     row, pose = [0] * len(lanes), [INDEX[name] for name in POSE]
     borders = np.unique(np.concatenate([span.ravel() for span in spans]))
     for p, q in itertools.pairwise(borders.tolist()):
         live = [i for i, span in enumerate(spans) if span[-1, 1] > p]
         if len(live) < len(fleet.plants):
             fleet = _fleet([lanes[i] for i in live])
-        count = q - p + 1
-        parts, inputs = list[Array](), list[Array]()
-        for i in live:
-            k = int(np.searchsorted(spans[i][:, 0], p, side="right")) - 1
-            part, first = out[i][row[i] : row[i] + count], int(lanes[i].log.windows[0, 0]) + p
-            if p == spans[i][k, 0]:
-                part[0] = x[i]
+        windows = [int(np.searchsorted(spans[i][:, 0], p, side="right")) - 1 for i in live]
+        begin = [int(spans[i][k, 0]) for i, k in zip(live, windows, strict=True)]
+        direct = not any((p - b) % every or (q - b) % every for b in begin)
+        step, parts, inputs = every if direct else 1, list[Array](), list[Array]()
+        for i, k, b in zip(live, windows, begin, strict=True):
+            count, first = (q - p) // step + 1, int(lanes[i].log.windows[0, 0]) + p
+            part = out[i][row[i] : row[i] + count] if direct else np.empty((count, len(STATES)))
+            part[0] = x[i]
+            if p == b:
                 part[0, pose] = lanes[i].start[k]
             parts.append(part)
-            inputs.append(lanes[i].inputs[first : first + count])
-            row[i] += count if q == spans[i][k, 1] else count - 1
+            inputs.append(lanes[i].inputs[first : first + q - p + 1])
             x[i] = part[-1]  # a view, filled by `fleet.drive`
-        fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S)
+        fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S, step)
+        for i, k, b, part in zip(live, windows, begin, parts, strict=True):
+            if not direct:
+                kept = part[(b - p) % every :: every]
+                out[i][row[i] : row[i] + len(kept)] = kept
+            row[i] += (b - p) // every - (b - q) // every  # samples before q
+            row[i] += int(q == spans[i][k, 1] and (q - b) % every == 0)
     for states in out:
         blank_what_diverged(states[None])
     return out

@@ -224,9 +224,9 @@ def linearise_all(courses: Sequence[Course], candidates: Candidates) -> list[Lin
     for group in effect_groups(candidates):
         pairs = [(i, k) for i, some in enumerate(effects) for k in group if k in some]
         given = [(courses[i].log, courses[i].model, effects[i][k], courses[i].start) for i, k in pairs]
-        lanes = make_lanes(given, candidates, group)
-        for (i, k), lane, x in zip(pairs, lanes, simulate_lanes(lanes) if lanes else (), strict=True):
-            coarse = x[coarse_subset(lane.log)]
+        lanes, every = make_lanes(given, candidates, group), 1 if NOMINAL in group else COARSE_STEP
+        for (i, k), lane, x in zip(pairs, lanes, simulate_lanes(lanes, every) if lanes else (), strict=True):
+            coarse = x[coarse_subset(lane.log)] if every == 1 else x
             driven[i][k] = _Driven(lane, coarse, group, x if k == NOMINAL else None)
     return [_linearisation(*own, candidates) for own in zip(courses, effects, driven, strict=True)]
 
