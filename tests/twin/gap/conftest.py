@@ -30,5 +30,5 @@ def fitted_once() -> Iterator[None]:
         return FITTED[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evidence, "set_to_references", remembered)
+        patch.setattr(evidence, "set_as_before", remembered)
         yield

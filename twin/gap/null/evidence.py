@@ -15,9 +15,10 @@ from terrafusion.twin.gap.data.logs import digest, prepared
 from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.null.kept_fit import set_as_before
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
-from terrafusion.twin.gap.null.reference_twin import all_residuals, differences, set_to_references
+from terrafusion.twin.gap.null.reference_twin import all_residuals, differences
 from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
 from terrafusion.twin.gap.rollout.residuals import (
@@ -90,7 +91,7 @@ def gather_evidence(
     known = {} if cache is None else cache
     if references:
         given = model
-        model = set_to_references(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
+        model = set_as_before(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
         logs, notes = [driven_by(log, model.vehicle) for log in logs], [*notes, *differences(given, model)]
     candidates = candidates.beside(model.effects)
     linearised, done = LinearisationCache(model, candidates, known), itertools.count(1)

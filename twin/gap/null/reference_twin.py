@@ -233,8 +233,8 @@ def set_to_references(
     for again in (False, True):
         runs = all_residuals(logs[:RUNS], cache, channels, jobs)
         noise = learn_noise(runs, [], cache.candidates, jobs)
-        numbers = _numbers(cache, commanded=any(run.log.commanded for run in runs))
-        fit = _Fit(cache, noise, numbers, [whitened(run.without_nuisance(), noise) for run in runs], jobs)
+        white = [whitened(run.without_nuisance(), noise) for run in runs]
+        fit = _Fit(cache, noise, numbers(cache, logs), white, jobs)
         w = fit.solve(again)
         model = fit.model(w)
         if not w.any():  # the noise would be learnt as before
@@ -243,8 +243,9 @@ def set_to_references(
     return model
 
 
-def _numbers(cache: LinearisationCache, commanded: bool) -> list[Coordinate]:
+def numbers(cache: LinearisationCache, logs: Sequence[PreparedLog]) -> list[Coordinate]:
     """What is fitted, as the solver sees it."""
+    commanded = any(log.commanded for log in logs[:RUNS])
     keys, vehicle = {f"effects.{key}" for key in cache.candidates.keys}, cache.model.vehicle
     names = [name for name in NUMBERS if name in keys or not name.startswith("effects.")]
     if vehicle.drive.type == "differential" and BASE.partition(".")[2] not in vehicle.measured:

@@ -13,6 +13,7 @@ from terrafusion.twin.engine import compiler, native
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.null import evidence as gathering
 from terrafusion.twin.gap.null import reference_twin
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -23,6 +24,7 @@ from tests.twin.gap.runs import DRIVE, run, runs
 def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("RUNS", "FIRST_STEPS", "STEPS"):  # the virtual machine takes seconds for a step of the fit
         monkeypatch.setattr(reference_twin, name, 1)
+    monkeypatch.setattr(gathering, "set_as_before", reference_twin.set_to_references)
     monkeypatch.setattr(reference_twin, "STARTS", {})
     monkeypatch.setattr(reference_twin, "LATER", ())
     short = dataclasses.replace(DRIVE, duration_s=9.0, drive=DRIVE.drive[:4])
