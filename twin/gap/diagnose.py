@@ -111,14 +111,14 @@ def diagnose_evidence(
         in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
     scales = SCATTER_SCALES[-1:] if uncalibrated else SCATTER_SCALES
-    offsets = learn_offsets(normal, len(candidates.keys), scales)
+    offsets = learn_offsets(normal, len(candidates.keys), scales, evidence.jobs)
     planner = Planner.of(evidence, sigma, offsets, scores)
     judged, robot = evidence, offsets
     if not uncalibrated:
         judged, robot = with_law_misfit(evidence, sigma, offsets)
         scores = [score(run, sigma) for run in judged.runs]
     # infer: is there a gap, and which effects explain it
-    detection = detect(scores, robot, candidates, seed)
+    detection = detect(scores, robot, candidates, seed, evidence.jobs)
     explanation = explain(judged, sigma, robot, close=detection.p_value <= significance)
     if progress is not None:
         progress(0.9)

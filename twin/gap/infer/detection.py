@@ -21,6 +21,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import Indices
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.null.score import Score
 
@@ -49,14 +50,15 @@ class Detection:
     p_value: float
 
 
-def detect(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int) -> Detection:
+def detect(
+    runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int, jobs: int = 1
+) -> Detection:
     """How unusual the judged runs are, taken together, among replicates of them, and without any one of them:
     a run that is odd by itself is no change of the robot."""
-    found = _of_all(runs, offsets, candidates, seed)
-    if len(runs) < FEWEST_AGREEING:
-        return found
-    fewer = ([*runs[:i], *runs[i + 1 :]] for i in range(len(runs)))
-    most = max(_of_all(some, offsets, candidates, seed).p_value for some in fewer)
+    many = len(runs) >= FEWEST_AGREEING
+    fewer = [[*runs[:i], *runs[i + 1 :]] for i in range(len(runs) if many else 0)]
+    found, *others = in_threads(jobs, lambda some: _of_all(some, offsets, candidates, seed), [runs, *fewer])
+    most = max((other.p_value for other in others), default=0.0)
     return dataclasses.replace(found, p_value=max(found.p_value, AGREEING * most))
 
 

@@ -22,6 +22,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.effects.terrain import FORMS as GROUND_FORMS
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.infer.close_look import modulation
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets, learn_misfit
 from terrafusion.twin.gap.null.drives import overlap
@@ -50,7 +51,9 @@ def with_law_misfit(
     def extended(run: WhitenedRun) -> WhitenedRun:
         return run.with_columns(_columns(run, evidence.model, certain, groups))
 
-    runs, references = ([extended(run) for run in some] for some in (evidence.runs, evidence.references))
+    runs, references = (
+        in_threads(evidence.jobs, extended, some) for some in (evidence.runs, evidence.references)
+    )
     twists = [[commanded_twist(r.log, evidence.model)[1] for r in some] for some in (runs, references)]
     count = runs[0].by_parameter.shape[1] - len(certain)
     changed = 2.0 * MISFIT**2 * (1.0 - overlap(*twists)) * np.append(certain**2, np.ones(count))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.score import Score
 from terrafusion.twin.gap.rollout.nuisance import BASIS
 
@@ -84,7 +85,7 @@ class RobotOffsets:
 
 
 def learn_offsets(
-    references: Sequence[Score], candidates: int, scales: Sequence[float] = SCATTER_SCALES
+    references: Sequence[Score], candidates: int, scales: Sequence[float] = SCATTER_SCALES, jobs: int = 1
 ) -> RobotOffsets:
     """From references; fewer than `FEWEST` show no scatter. The first `candidates` columns are of effects.
 
@@ -96,7 +97,9 @@ def learn_offsets(
     group = np.maximum(np.arange(len(first)) - candidates, -1) // len(BASIS)
     groups = [group == k for k in np.unique(group)]
     prior = np.ones(len(first))
-    found = [_learn(references, scale**2 * first, prior, EM_STEPS, groups) for scale in scales]
+    found = in_threads(
+        jobs, lambda scale: _learn(references, scale**2 * first, prior, EM_STEPS, groups), scales
+    )
     return max(found, key=lambda o: _log_likelihood(references, o.scatter, o.prior))
 
 

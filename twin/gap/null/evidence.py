@@ -100,7 +100,7 @@ def gather_evidence(
         if progress is not None:
             progress(0.7 * next(done) / len(logs))
 
-    residuals = all_residuals(logs, linearised, channels, jobs, count)
+    residuals = all_residuals(logs, linearised, channels, jobs, count, R)
     first = learn_noise(residuals[R:], residuals[:R], candidates, jobs)
     free = at_run_soil(residuals, linearised, first, jobs=jobs)
     limit = soil_limit(free[R:], candidates)

@@ -8,6 +8,7 @@ Gauss-Newton steps (Marquardt 1963), from the best of a few starts.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -79,16 +80,17 @@ def all_residuals(
     channels: Sequence[str],
     jobs: int,
     done: Callable[[], None] = lambda: None,
+    judged: int = 0,
 ) -> list[RunResiduals]:
     """Errors and derivatives of each run. The first run of each drive makes its linearisation, whichever
-    thread is faster."""
+    thread is faster; the first `judged` ones come last, as the fit has references only."""
 
     def one(log: PreparedLog) -> RunResiduals:
         found = run_residuals(log, cache, channels)
         done()
         return found
 
-    first = {cache.key(log): log for log in reversed(logs)}
+    first = {cache.key(log): log for log in reversed([*logs[judged:], *logs[:judged]])}
     in_threads(jobs, cache.of, reversed(first.values()))
     return in_threads(jobs, one, logs)
 
@@ -146,14 +148,22 @@ class _Fit:
             out.append(known if len(known) == count else None)
         return out
 
-    def inner(self, columns: Sequence[Array]) -> Array:
-        """Inner products of columns (n, M) of each run, sensor states and effects projected out."""
-        soil, total = len(soil_columns(self.cache.candidates)), np.zeros((columns[0].shape[1],) * 2)
-        for run, own in zip(self.runs, columns, strict=True):
+    @functools.cached_property
+    def beside(self) -> list[tuple[Array, Array]]:
+        """Columns J (n, C) of sensor states and effects of each run, and 1 + J'J."""
+        soil, out = len(soil_columns(self.cache.candidates)), list[tuple[Array, Array]]()
+        for run in self.runs:
             J = run.rows[:, soil:-1].astype(float)
             J[:, run.states - soil :] *= EFFECT_SIGMA
+            out.append((J, J.T @ J + np.eye(J.shape[1])))
+        return out
+
+    def inner(self, columns: Sequence[Array]) -> Array:
+        """Inner products of columns (n, M) of each run, sensor states and effects projected out."""
+        total = np.zeros((columns[0].shape[1],) * 2)
+        for (J, H), own in zip(self.beside, columns, strict=True):
             cross = J.T @ own
-            total += own.T @ own - cross.T @ np.linalg.solve(J.T @ J + np.eye(J.shape[1]), cross)
+            total += own.T @ own - cross.T @ np.linalg.solve(H, cross)
         return total
 
     def cost(self, w: Array, errors: Sequence[Array] | None) -> float:
