@@ -14,7 +14,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig, Estimato
 from terrafusion.fusion.config.sensor_config import sensor_config_of
 from terrafusion.fusion.estimate.estimate import Estimate, State
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, with_usable_samples
+from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, wheels_of, with_usable_samples
 from terrafusion.fusion.estimator.history import History
 from terrafusion.fusion.estimator.imu_level import ImuLevel
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
@@ -186,6 +186,7 @@ def _prepare(
     grounds: GroundMemory | None,
 ) -> _Drive:
     """Choose the robot and the noise, and split the fixes into those used and those held out."""
+    wheels_of(recording)  # refused before a vehicle is asked for
     params, vehicle_notes = choose_vehicle(recording, vehicle)
     used, held_out = split_fixes(recording, outages)
     noise = policy if isinstance(policy, Policy) else load_policy(policy)

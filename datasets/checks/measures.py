@@ -26,6 +26,7 @@ from terrafusion.datasets.checks.path import (
     scale_of,
 )
 from terrafusion.datasets.checks.signals import MEASURED
+from terrafusion.datasets.checks.timing import is_gap
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
@@ -41,6 +42,8 @@ LAG_PAIRS = {
 """By quantity: channels whose signals are compared in time."""
 LEAST_R, LEAST_TRACK_R = 0.5, 0.8
 """A lag, and a track, at a lower correlation is noise and is not reported."""
+RULER_SIGMAS = 3.0
+"""The path of the fixes is measured in steps of so many sigmas, so that noise at rest adds nothing."""
 HELD = 0.8
 """A channel whose values change at less than this share of its rate is held."""
 
@@ -265,15 +268,17 @@ def _path_lengths(context: CheckContext) -> Iterator[tuple[str, float]]:
     wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
     if wheels is not None and radius is not None and len(wheels) > 1:
         v = np.nan_to_num(np.abs(wheels.side_speeds_mps(radius).mean(axis=1)))
-        yield "wheels", float(np.sum(0.5 * (v[1:] + v[:-1]) * np.diff(wheels.t_ns)) * 1e-9)
+        dt = np.diff(wheels.t_ns) * 1e-9
+        dt[is_gap(wheels.t_ns)] = 0.0  # how far it went there is unknown
+        yield "wheels", float(np.sum(0.5 * (v[1:] + v[:-1]) * dt))
     if gnss is not None:
-        yield "gnss", _ruler_path_m(gnss.enu_m, max(0.5, 3.0 * (motion.typical_sigma(gnss) or 1.0)))
+        yield "gnss", _ruler_path_m(gnss.enu_m, max(0.5, RULER_SIGMAS * (motion.typical_sigma(gnss) or 1.0)))
     if truth is not None and np.isfinite(truth.position_m[:, 0]).any():
         yield "truth", _ruler_path_m(truth.position_m, 0.1)
 
 
 def _ruler_path_m(position_m: Array, ruler_m: float) -> float:
-    """Length of the path in steps longer than the ruler, so that noise at rest adds nothing."""
+    """Length of the path in steps longer than the ruler."""
     points = position_m[np.isfinite(position_m[:, :2]).all(axis=1), :2].tolist()
     if not points:
         return 0.0

@@ -18,7 +18,7 @@ from terrafusion.datasets.checks.finding import (
 )
 from terrafusion.datasets.checks.motion import ANY_RADIUS_M, runs, yaw_rates
 from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
-from terrafusion.datasets.core.channels import Channel, Imu, Wheels
+from terrafusion.datasets.core.channels import Channel, Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.recording import Recording
@@ -311,11 +311,13 @@ def _turn_radps(context: CheckContext) -> float:
 def check_missing(context: CheckContext) -> Iterator[Finding]:
     """Empty cells in columns that have values."""
     for name, channel in context.recording.channels().items():
-        if name not in ("command", "wheels", "imu", "motor") or len(channel) < STUCK_ROWS:
+        if name not in ("command", "wheels", "imu", "motor", "gnss") or len(channel) < STUCK_ROWS:
             continue
         if isinstance(channel, Wheels) and sampled_apart(channel):
             continue  # see wheels.check_apart
         columns = {c: np.isnan(v) for c, v in channel.columns().items() if v.dtype.kind == "f"}
+        if isinstance(channel, Gnss):
+            columns = {c: columns[c] & (channel.fix > Fix.NONE) for c in ("east_m", "north_m")}
         share = {column: float(empty.mean()) for column, empty in columns.items() if not empty.all()}
         if not share or max(share.values()) <= MISSING_SHARE:
             continue

@@ -14,7 +14,7 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import Finding
 from terrafusion.datasets.checks.measures import Measures
-from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
+from terrafusion.datasets.checks.timing import is_gap
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.json_text import finite
@@ -89,7 +89,7 @@ def clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
         "rate_hz": 1.0 / period if period > 0 else None,
         "start_s": float(t_ns[0] - start_ns) * 1e-9,
         "end_s": float(t_ns[-1] - start_ns) * 1e-9,
-        "gaps": int(((dt > GAP_PERIODS * period) & (dt > GAP_S)).sum()),
+        "gaps": int(is_gap(t_ns).sum()),
         "longest_gap_s": float(dt.max()) if len(dt) else None,
     }
 
@@ -98,9 +98,7 @@ def mean_rate_hz(t_ns: TimesNs) -> float | None:
     """Rate over the span without its gaps: of stamps that vary by the time on the way the median interval is
     too short.
     """
-    dt = np.diff(t_ns) * 1e-9
-    period = float(np.median(dt)) if len(dt) else 0.0
-    held = dt[(dt <= GAP_PERIODS * period) | (dt <= GAP_S)]
+    held = np.diff(t_ns)[~is_gap(t_ns)] * 1e-9
     return len(held) / float(held.sum()) if held.sum() > 0.0 else None
 
 

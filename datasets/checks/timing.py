@@ -16,7 +16,7 @@ from terrafusion.datasets.checks.finding import (
     retimed,
     retiming,
 )
-from terrafusion.datasets.core.arrays import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.conventions import numbers_of, true_updates
 from terrafusion.datasets.core.printable import counted
@@ -184,7 +184,7 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
         if not (dt > 0).any() or coarse_tick_s(channel):
             continue
         period = period_s(channel.t_ns)
-        gaps = np.flatnonzero((dt > GAP_PERIODS * period) & (dt > GAP_S))
+        gaps = np.flatnonzero(is_gap(channel.t_ns) & (dt > 0.0))
         missing = _missing(dt[dt <= GAP_PERIODS * period] / period) if len(dt) >= LEAST_ROWS else 0
         if gaps.size:
             worst = int(gaps[np.argmax(dt[gaps])])
@@ -196,10 +196,30 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
         elif missing > MISSING_SHARE * (len(channel) + missing):
             what = f"{missing / (len(channel) + missing):.0%} of the samples are missing, one here and there"
             evidence = f"intervals of whole multiples of {period * 1e3:.3g} ms, {missing} of which are empty"
+        elif (early_s := _early_s(context, name)) > max(GAP_PERIODS * period, GAP_S):
+            what = f"ends {early_s:.2f} s before the other channels"
+            evidence = f"its last sample is at t = {context.since_start_s(channel.t_ns[-1]):.2f} s"
         else:
             continue
         fix = "expect larger uncertainty there, and look for dropped messages: what is missing is unknown"
         yield Finding("gaps", "warning", name, what, evidence, fix)
+
+
+def _early_s(context: CheckContext, name: str) -> float:
+    """Seconds from the end of a sensor to that of all others, where they are a share of the log; else 0."""
+    clocks = {o: t for o, t in clocks_of(context.recording).items() if o in ("wheels", "imu", "gnss")}
+    others = [t for o, t in clocks.items() if o != name]
+    if name not in clocks or not others or clocks[name][-1] < max(t[0] for t in others):
+        return 0.0
+    end = min(t[-1] for t in others)
+    early_s = float(end - clocks[name][-1]) * 1e-9
+    return early_s if early_s > SAME_SPAN * context.since_start_s(end) else 0.0
+
+
+def is_gap(t_ns: TimesNs) -> Mask:
+    """Which of the intervals (N - 1,) are gaps: longer than a few periods and than a fraction of a second."""
+    dt = np.diff(t_ns) * 1e-9
+    return np.asarray((dt > GAP_PERIODS * period_s(t_ns)) & (dt > GAP_S))
 
 
 def _missing(steps: Array) -> int:

@@ -26,14 +26,21 @@ def unwrapped(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | 
     """
     if angle_rad is None:
         return None, ""
-    out, wrapped = angle_rad, []
+    out, wrapped, rolled = angle_rad, [], []
     for k, name in enumerate(names):
         held = np.isfinite(angle_rad[:, k])
         angle = angle_rad[held, k]
         with np.errstate(over="ignore"):  # no wheel turns so far, and no log that holds it is wrapped
             steps, range_rad = np.diff(angle), np.ptp(angle) if len(angle) else 0.0
         jumps, large = (np.count_nonzero(np.abs(steps) > share * TURN_RAD) for share in (NEARLY, LARGEST))
-        if not (jumps or large > MOST_LARGE) or range_rad > WITHIN * TURN_RAD:
+        if range_rad > WITHIN * TURN_RAD:
+            lost = _rolled_over(steps, float(range_rad))
+            if lost.any():
+                out = out.copy() if out is angle_rad else out
+                out[held, k] = angle + np.concatenate([[0.0], np.cumsum(lost)])
+                rolled.append(name)
+            continue
+        if not (jumps or large > MOST_LARGE):
             continue
         turns = np.rint(steps / TURN_RAD)
         if (np.abs(steps - TURN_RAD * turns) > LARGEST * TURN_RAD).any():
@@ -44,8 +51,31 @@ def unwrapped(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | 
         out = out.copy() if out is angle_rad else out
         out[held, k] = angle - TURN_RAD * np.concatenate([[0.0], np.cumsum(turns)])
         wrapped.append(name)
-    note = f"the angles of {', '.join(wrapped)} start again after each turn; whole turns are counted"
-    return out, note if wrapped else ""
+    notes = [f"the angles of {', '.join(wrapped)} start again after each turn; whole turns are counted"]
+    if rolled:
+        what = f"the counters of {', '.join(rolled)} roll over, or were reset"
+        notes = [*(notes if wrapped else []), f"{what}; there the wheel's speed is taken from beside"]
+    return out, "; ".join(notes) if wrapped or rolled else ""
+
+
+def _rolled_over(steps: Array, range_rad: float) -> Array:
+    """What to add to the steps (N,) of a counter that starts again beyond one turn; zero elsewhere.
+
+    Such a step is most of the range, against the way that the wheel turns beside it; all others are small.
+    """
+    lost = np.zeros_like(steps)
+    far = np.abs(steps) > NEARLY * range_rad
+    if not far.any() or (np.abs(steps[~far]) > LARGEST * range_rad).any():
+        return lost
+    rows = np.flatnonzero(far)
+    small = np.where(far, np.nan, steps)
+    near = np.stack([np.concatenate([[np.nan], small])[rows], np.concatenate([small, [np.nan]])[rows + 1]])
+    if np.isnan(near).all(axis=0).any():
+        return lost
+    beside = np.nanmean(near, axis=0)
+    if (beside * steps[rows] < 0.0).all():
+        lost[rows] = beside - steps[rows]
+    return lost
 
 
 def unwrapped_beside_speeds(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | None, str]:

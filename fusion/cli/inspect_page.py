@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
+from terrafusion.datasets.checks.measures import RULER_SIGMAS
 from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.common import Line, styled
 
@@ -16,6 +17,8 @@ CENTURY_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
 
 WIDTH = 100
 INDENT = 10
+LONG_STEP_M = 2.0
+"""Longer steps cut the turns of a robot."""
 MOST_WORDS = 12
 GLUE = "\N{NO-BREAK SPACE}"
 
@@ -84,7 +87,7 @@ def clock_table(channels: dict[str, Any], head: str = "channel") -> Iterator[Lin
             "-" if not rate or not sampled else _spread(rate, ".4g") if pooled else f"{rate:.4g}",
             f"{c['recordings']}" if pooled else f"{c['start_s']:.1f} to {c['end_s']:.1f}",
             str(c["gaps"]) if sampled else "-",
-            f"{gap:.2g}" if c["gaps"] and sampled else "-",
+            f"{gap:.{0 if gap > 10 else 1}f}" if c["gaps"] and sampled else "-",
         ])  # fmt: skip
     yield "", ""
     for number, line in enumerate(text_table(heads, rows, right=range(1, len(heads)))):
@@ -128,7 +131,10 @@ def measured_texts(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
         interval = f"{ratio['low']:.3f} to {ratio['high']:.3f}; {ratio['stretches']} stretches"
         yield "speed", f"{name} over wheels {ratio['ratio']:.3f} ({interval})"
     if measured["path_m"]:
-        yield "path", ", ".join(f"{name} {length:.1f} m" for name, length in measured["path_m"].items())
+        step_m = RULER_SIGMAS * sigma["median"] if sigma else 0.0
+        cut = {"gnss": f" (in steps of {step_m:.0f} m, which cut its turns)"} if step_m > LONG_STEP_M else {}
+        lengths = measured["path_m"].items()
+        yield "path", ", ".join(f"{name} {length:.1f} m{cut.get(name, '')}" for name, length in lengths)
     if sigma:
         spread = f"{sigma['min']:.3g} to {sigma['max']:.3g} m, median {sigma['median']:.3g} m"
         yield "sigma", f"of the fixes, horizontal, {spread}"

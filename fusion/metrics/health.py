@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks.timing import is_gap
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -46,6 +47,7 @@ def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Hea
     sides = sides[np.isfinite(sides).all(axis=1)]
     fastest = float(np.abs(sides).max()) if len(sides) else 0.0
     rolled = rolled_m(wheels, radius_m)
+    seen_m = float(np.diff(rolled_until_m(wheels, radius_m))[~is_gap(wheels.t_ns)].sum())
     why = ""
     if not finite:
         why = "positions or velocities are not finite"
@@ -55,7 +57,7 @@ def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Hea
         why = f"{speed:.1f} m/s with wheels of at most {fastest:.1f} m/s"
     elif moved > MOST_PATH * rolled + PATH_SLACK_M:
         moved = beyond_noise_m(path)
-    if not why and not LEAST_PATH * rolled - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
+    if not why and not LEAST_PATH * seen_m - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
         why = f"a path of {moved:.0f} m where the wheels rolled {rolled:.0f} m"
     return Health(speed, moved, rolled, why)
 

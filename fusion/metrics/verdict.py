@@ -241,10 +241,8 @@ def _certain(run: Run) -> Iterator[Reason]:
         )
     yaw_sigma = float(np.sqrt(path.covariance[-1, 5, 5]))
     if yaw_sigma > YAW_SIGMA_KNOWN_RAD:
-        remedy = "without fixes it drifts" if run.used is None else "drive on, so that fixes show it"
-        yield doubtful(
-            f"the heading is known to {np.degrees(yaw_sigma):.0f} deg only (1 sigma) at the end: {remedy}"
-        )
+        why = "drive on" if run.used is not None else "without fixes nothing corrects it"
+        yield doubtful(f"the heading is unknown at the end: {np.degrees(yaw_sigma):.0f} deg (1 sigma); {why}")
 
 
 def _innovations(run: Run) -> Iterator[Reason]:

@@ -55,6 +55,26 @@ def test_a_standing_robot_has_no_path(drive: Recording) -> None:
     assert measure([still]).path_m["gnss"] < 1.0
 
 
+def test_a_gap_of_the_wheels_adds_no_path(drive: Recording, husky_rig: Rig) -> None:
+    """A clock that leaps an hour ahead is no hour of driving."""
+    wheels = drive.wheels
+    assert wheels is not None
+    leap = np.where(np.arange(len(wheels)) > len(wheels) // 2, 3600 * 10**9, 0)
+    late = dataclasses.replace(drive, wheels=dataclasses.replace(wheels, t_ns=wheels.t_ns + leap))
+    path_m = measure([drive], husky_rig).path_m["wheels"]
+    assert measure([late], husky_rig).path_m["wheels"] == pytest.approx(path_m, rel=0.01)
+
+
+def test_long_steps_of_the_fixes_are_named(drive: Recording) -> None:
+    assert drive.gnss is not None
+    coarse = dataclasses.replace(drive.gnss, sigma_enu_m=np.full((len(drive.gnss), 3), 3.0))
+    for recording, words in (
+        (drive, "m, truth"),
+        (dataclasses.replace(drive, gnss=coarse), "(in steps of 9 m"),
+    ):
+        assert words in lines_of(summarise(recording, measure([recording]), []))
+
+
 def lines_of(page: dict) -> str:
     json.dumps(page, allow_nan=False)
     lines = [line for _, line in (*contents_lines(page), *finding_lines(page))]

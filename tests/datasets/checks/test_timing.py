@@ -242,8 +242,9 @@ def test_value_faults_are_found_and_repaired(drive: Recording, name: str) -> Non
             rows("wheels", lambda t: np.random.default_rng(0).random(len(t)) > 0.2),
             "of the samples are missing",
         ),
+        (rows("imu", lambda t: t < 30.0), "before the other channels"),
     ],
-    ids=["a gap", "dropped messages"],
+    ids=["a gap", "dropped messages", "a file cut off"],
 )
 def test_what_is_missing_stays_missing(drive: Recording, corrupt: Corrupt, words: str) -> None:
     corrupted = corrupt(drive)
@@ -253,6 +254,18 @@ def test_what_is_missing_stays_missing(drive: Recording, corrupt: Corrupt, words
     assert finding.repair is None
     assert "unknown" in finding.fix
     assert repair(corrupted) == (corrupted, [])
+
+
+def test_fixes_without_a_position_are_missing(drive: Recording) -> None:
+    assert drive.gnss is not None
+    enu_m = drive.gnss.enu_m.copy()
+    enu_m[: len(enu_m) // 5, 0] = np.nan
+    (finding,) = found_in(dataclasses.replace(drive, gnss=dataclasses.replace(drive.gnss, enu_m=enu_m)))
+    assert (finding.code, finding.channel, finding.what) == (
+        "missing-values",
+        "gnss",
+        "20% of east_m is missing",
+    )
 
 
 def test_a_channel_that_ends_early_has_no_drift_and_no_jump(drive: Recording) -> None:

@@ -36,6 +36,31 @@ def test_angles_beyond_one_turn_are_returned_as_they_are(angle: np.ndarray) -> N
         assert unwrapped(both, ("left", "right"))[0] is both
 
 
+@pytest.mark.parametrize("range_rad", [7.3, 20.1, 411.8])
+def test_a_counter_that_rolls_over_goes_on(range_rad: float) -> None:
+    """16 bits of ticks are no whole number of turns; what is lost at the step is taken from beside it."""
+    t = np.arange(0.0, 300.0, 0.05)
+    true = np.cumsum(0.3 + 0.2 * np.sin(t / 5.0))
+    counts = np.stack([true % range_rad, -true % range_rad, true], axis=1)
+    angle, note = unwrapped(counts, ("left", "right", "third"))
+    assert angle is not None
+    rolled = (np.abs(np.diff(counts[:, 0])) > range_rad / 2.0).sum()
+    for column, sense in ((0, 1.0), (1, -1.0)):
+        moved = sense * (angle[:, column] - angle[0, column])
+        np.testing.assert_allclose(moved, true - true[0], atol=2e-3 * rolled)
+    assert angle[:, 2].tobytes() == true.tobytes()
+    assert note.startswith("the counters of left, right roll over, or were reset")
+
+
+@pytest.mark.parametrize("angle", [
+    np.r_[np.linspace(0.0, 50.0, 99), 0.0, np.linspace(50.5, 99.0, 99)],
+    np.r_[np.linspace(0.0, 20.0, 99), np.linspace(95.0, 99.0, 99)],
+    np.r_[np.full(50, 0.0), 9.0, np.full(50, 0.0)],
+], ids=["an outlier", "a gap", "one jolt"])  # fmt: skip
+def test_other_steps_are_no_counter_that_rolls_over(angle: np.ndarray) -> None:
+    assert unwrapped(angle[:, None], ("left",))[1] == ""
+
+
 def test_a_slow_log_of_less_than_a_turn_keeps_its_bits() -> None:
     angle = np.array([[0.0], [0.0], [2.5], [2.5], [5.0], [5.1]])
     assert unwrapped(angle, ("left",)) == (angle, "")

@@ -56,3 +56,14 @@ def test_rolled_path_counts_both_ways_and_units() -> None:
     assert rolled_m(Wheels(t_ns, -ahead, ("left", "right"), "radps"), 0.3) == pytest.approx(6.0)
     assert rolled_m(Wheels(t_ns, ahead * [1, -1], ("left", "right"), "mps"), 0.3) == 0.0
     assert rolled_m(Wheels(t_ns[:0], ahead[:0], ("left", "right"), "mps"), 0.3) == 0.0
+
+
+def test_a_gap_of_the_wheels_does_not_make_the_path_too_short(drive: Callable[..., Any]) -> None:
+    """A clock that leaps an hour ahead while the robot drives."""
+    made = drive(seconds=60.0)
+    leap = np.where(np.arange(len(made.recording.wheels)) > 100, 3600 * SECOND_NS, 0)
+    path = made.estimate.trajectory
+    jump = np.where(path.t_ns > made.recording.wheels.t_ns[100], 3600 * SECOND_NS, 0)
+    wheels = dataclasses.replace(made.recording.wheels, t_ns=made.recording.wheels.t_ns + leap)
+    estimate = dataclasses.replace(made.estimate, trajectory=dataclasses.replace(path, t_ns=path.t_ns + jump))
+    assert examine_estimate(estimate, wheels, 0.3).why == ""

@@ -159,6 +159,23 @@ def test_what_is_not_known_is_doubtful(drive):
     assert "known to 40 m only" in verdict(d, estimate=consistent(d)).reasons[0]
 
 
+@pytest.mark.parametrize(
+    ("fixes", "remedy"), [(True, "drive on"), (False, "without fixes nothing corrects it")]
+)
+def test_an_unknown_heading_has_a_remedy_that_helps(drive, fixes, remedy):
+    d = drive()
+    P = d.estimate.trajectory.covariance.copy()
+    P[-1, 5, 5] = 1.0
+    estimate = dataclasses.replace(
+        d.estimate, trajectory=dataclasses.replace(d.estimate.trajectory, covariance=P)
+    )
+    used = d.fixes if fixes else None
+    reasons = judge(
+        Run(d.recording, estimate, score(estimate, d.recording), Baselines(), used, (), RIG)
+    ).reasons
+    assert any("57 deg" in reason and reason.endswith(remedy + ".") for reason in reasons)
+
+
 def test_a_path_that_fixes_never_placed_is_not_to_be_used(drive):
     d = drive()
     local = dataclasses.replace(d.estimate, status=np.full(len(d.estimate.status), "no_gnss", dtype=object))
