@@ -246,10 +246,7 @@ def _run_estimator(
             watch(estimator)
 
     estimator = Estimator(
-        config,
-        on_state=keyframe,
-        on_innovation=history.innovations.append,
-        archive=archive,
+        config, on_state=keyframe, on_innovation=history.innovations.append, archive=archive
     )
     if level is not None:
         estimator.learned.mounting.level.hold(level.known, level.corrects)

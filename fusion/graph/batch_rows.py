@@ -105,10 +105,7 @@ class RowBlock:
         return rows, self._counts
 
     def _grouped(
-        self,
-        unary: list[gtsam.NonlinearFactorGraph],
-        links: list[gtsam.NonlinearFactorGraph],
-        used: Places,
+        self, unary: list[gtsam.NonlinearFactorGraph], links: list[gtsam.NonlinearFactorGraph], used: Places
     ) -> list[_Group]:
         found: dict[tuple[tuple[int, ...], int], list[tuple[int, int, int]]] = defaultdict(list)
         count, rows = 0, used.tolist()

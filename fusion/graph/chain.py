@@ -25,12 +25,7 @@ from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import NAV, VELOCITY, KeyState, dim_of
-from terrafusion.fusion.graph.keyframe_rows import (
-    carried_prior,
-    link_rows,
-    measured_rows,
-    own_rows,
-)
+from terrafusion.fusion.graph.keyframe_rows import carried_prior, link_rows, measured_rows, own_rows
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import (
     back_substitute,

@@ -101,12 +101,7 @@ class KeyState:
         bias = gtsam.imuBias.ConstantBias(
             self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
         )
-        return KeyState(
-            self.pose.retract(delta[POSE]),
-            self.velocity + delta[VELOCITY],
-            bias,
-            linear,
-        )
+        return KeyState(self.pose.retract(delta[POSE]), self.velocity + delta[VELOCITY], bias, linear)
 
     def local(self, other: "KeyState") -> Array:
         """The vector (DIM,) from this state to `other`, to first order that of `retract`.

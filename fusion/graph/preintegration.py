@@ -30,10 +30,7 @@ class Preintegrator:
         self._params: dict[tuple[int, ...], gtsam.PreintegrationCombinedParams] = {}
 
     def integrate(
-        self,
-        segments: list[ImuSegment],
-        bias: gtsam.imuBias.ConstantBias,
-        noise: SensorNoise,
+        self, segments: list[ImuSegment], bias: gtsam.imuBias.ConstantBias, noise: SensorNoise
     ) -> gtsam.PreintegratedCombinedMeasurements:
         """Preintegrate the segments about `bias`."""
         measured = gtsam.PreintegratedCombinedMeasurements(self.params(segments, noise), bias)

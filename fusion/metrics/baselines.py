@@ -160,12 +160,7 @@ def _aligned_with(
 
 
 def _outage_end_m(
-    path: ReckonedPath,
-    known: Estimate,
-    errors: Errors,
-    rows: NDArray[np.intp],
-    begin_ns: int,
-    point: complex,
+    path: ReckonedPath, known: Estimate, errors: Errors, rows: NDArray[np.intp], begin_ns: int, point: complex
 ) -> float | None:
     """Error at the last reference of an outage, of dead reckoning from the estimate at its begin."""
     keys = known.trajectory

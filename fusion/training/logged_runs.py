@@ -55,8 +55,7 @@ def open_runs(
         raise DataError("the robot does not move on labelled ground in the logs given", channel="terrain")
     if len(names) > 1:
         raise DataError(
-            f"the logs are of {' and '.join(names)}",
-            remedy="give those of one robot, or --vehicle",
+            f"the logs are of {' and '.join(names)}", remedy="give those of one robot, or --vehicle"
         )
     return runs
 

@@ -28,12 +28,7 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import RobustTuning
-from terrafusion.fusion.weighting.weighting import (
-    InnovationTest,
-    NoiseInForce,
-    Weighting,
-    inflated,
-)
+from terrafusion.fusion.weighting.weighting import InnovationTest, NoiseInForce, Weighting, inflated
 
 IRLS_STEPS = 10
 LEAST_WEIGHT = 1e-6

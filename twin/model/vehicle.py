@@ -24,11 +24,7 @@ from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.sensor_realism import SensorRealism
 from terrafusion.twin.model.vehicle_file import read_vehicle
 
-GEOMETRY = {
-    "wheel_radius_m": "wheel.radius_m",
-    "track_m": "body.track_m",
-    "wheelbase_m": "body.wheelbase_m",
-}
+GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m", "wheelbase_m": "body.wheelbase_m"}
 """Odometry geometry a log may report, and the number of the body that it replaces, unless `measured`."""
 
 
