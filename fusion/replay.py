@@ -9,6 +9,7 @@ from terrafusion.datasets.checks import Finding, run_checks
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.assumptions import Assumption, assumptions
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
@@ -107,26 +108,42 @@ def replay(
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
     """
     drive = _prepare(recording, vehicle, mode, policy, outages, magnetometer, settings, grounds)
-    run = _run_estimator(drive, batch, progress, watch)
-    estimator = run.estimator
-
-    estimate = run.estimate((*drive.notes, *run.notes(), *drive.unused))
-    scores = drive.score(estimate, estimator)
-    alone = drive.baselines(estimate, scores, estimator)
-
-    rig = drive.config.rig
-    found = run_checks(recording, rig) if findings is None else findings
-    corrections = estimator.learned.corrections()
-    verdict = judge(Run(recording, estimate, scores, alone, drive.used, found, rig, corrections))
+    estimator, estimate, seconds, latencies_ms = _run_estimator(drive, batch, progress, watch)
+    scores, alone, verdict = judged(
+        recording, estimate, estimator, drive.config.rig, drive.used, drive.held_out, drive.outages, findings
+    )
     learned_grounds = estimator.weights.learned_grounds()
     if learned_grounds is not None and not learned_grounds.robot:
         learned_grounds.robot = drive.vehicle.name
     return ReplayResult(
         recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
-        drive.outages, run.seconds, run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
+        drive.outages, seconds, latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
         alone, verdict, drive.assumed, estimator.learned.table(), learned_grounds,
         estimator.weights.found_shares(),
     )  # fmt: skip
+
+
+def judged(
+    recording: Recording,
+    estimate: Estimate,
+    estimator: Estimator,
+    rig: Rig,
+    used: Gnss | None,
+    held_out: Gnss | None = None,
+    outages: Sequence[Outage] = (),
+    findings: Sequence[Finding] | None = None,
+) -> tuple[Scores, Baselines, Verdict]:
+    """Errors of an estimate against the truth or the fixes held out, those of wheels and gyro, and of the
+    receiver, alone, and the verdict; `findings` are those of the log checks, where they are known already."""
+    local = estimator.gnss.unplaced
+    scores = score(
+        estimate, recording, held_out=held_out, outages=outages, antenna_m=estimator.gnss.antenna_places,
+        aligned=local,
+    )  # fmt: skip
+    alone = baselines(recording, estimate, scores, used, outages, rig=rig, aligned=local)
+    found = run_checks(recording, rig) if findings is None else findings
+    corrections = estimator.learned.corrections()
+    return scores, alone, judge(Run(recording, estimate, scores, alone, used, found, rig, corrections))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,32 +164,6 @@ class _Drive:
     assumed: tuple[Assumption, ...]
     notes: tuple[str, ...]
     unused: tuple[str, ...]
-
-    def score(self, estimate: Estimate, estimator: Estimator) -> Scores:
-        """Errors against the truth or the fixes held out."""
-        return score(
-            estimate,
-            self.recording,
-            held_out=self.held_out,
-            outages=self.outages,
-            antenna_m=estimator.gnss.antenna_places,
-            aligned=estimator.gnss.unplaced,
-        )
-
-    def baselines(self, estimate: Estimate, scores: Scores, estimator: Estimator) -> Baselines:
-        """What wheels and gyro, and the receiver, give alone."""
-        rig = self.config.rig
-        return baselines(
-            self.recording,
-            estimate,
-            scores,
-            self.used,
-            self.outages,
-            wheel_radius_m=rig.wheel_radius_m,
-            track_m=rig.track_m,
-            antenna_m=rig.sensors.gnss.antenna_m,
-            aligned=estimator.gnss.unplaced,
-        )
 
 
 def _prepare(
@@ -205,37 +196,17 @@ def _prepare(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _FinishedRun:
-    """An estimator after the whole run, the states it made, and its computing time in all and by keyframe."""
-
-    estimator: Estimator
-    history: History
-    alignment_notes: tuple[str, ...]
-    seconds: float
-    latencies_ms: Array
-
-    def notes(self) -> tuple[str, ...]:
-        """What the run itself has to report."""
-        return (*self.alignment_notes, *notes_of(self.estimator))
-
-    def estimate(self, notes: tuple[str, ...]) -> Estimate:
-        """The states along time, with `notes`."""
-        weights = self.estimator.weights
-        changes = [*self.history.changes, *weights.take_changes()]
-        return self.history.estimate(weights.detector.classes, changes, notes)
-
-
 def _run_estimator(
     drive: _Drive,
     batch: bool,
     progress: Callable[[float], None] | None,
     watch: Callable[[Estimator], None] | None,
     level: ImuLevel | None = None,
-) -> _FinishedRun:
+) -> tuple[Estimator, Estimate, float, Array]:
     """Feed the samples as live; for a batch, then smooth the whole run.
 
-    A batch in which the IMU proves tilted begins again with its samples levelled, by `level`.
+    Gives the computing time in all, s, and by keyframe, ms, too. A batch in which the IMU proves tilted
+    begins again with its samples levelled, by `level`.
     """
     config = drive.config
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
@@ -261,4 +232,7 @@ def _run_estimator(
     seconds = time.perf_counter() - started
     if not history.states:
         raise never_started(drive.given, drive.config.rig.wheel_radius_m)
-    return _FinishedRun(estimator, history, alignment_notes, seconds, latencies_ms)
+    notes = (*drive.notes, *alignment_notes, *notes_of(estimator), *drive.unused)
+    changes = [*history.changes, *estimator.weights.take_changes()]
+    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
+    return estimator, estimate, seconds, latencies_ms

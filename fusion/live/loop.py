@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.heap import older_objects_unsearched
 from terrafusion.datasets.core.messages import ImuSample, Message
@@ -17,10 +16,8 @@ from terrafusion.fusion.config.sensor_config import imu_kind, sensor_config_of
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.metrics.baselines import baselines
-from terrafusion.fusion.metrics.judged_run import Run
-from terrafusion.fusion.metrics.scores import score
-from terrafusion.fusion.metrics.verdict import Verdict, judge
+from terrafusion.fusion.metrics.verdict import Verdict
+from terrafusion.fusion.replay import judged
 from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.twin.model.choose import choose_vehicle
 
@@ -85,17 +82,8 @@ def live_estimator(
 def verdict_of(estimator: Estimator, history: History, recording: Recording) -> Verdict:
     """The verdict on a finished run that got all fixes, against the truth where the recording has one."""
     history.align(estimator.gnss.alignment, batch=False)
-    rig, local = estimator.config.rig, estimator.gnss.unplaced
-    antenna_m = rig.sensors.gnss.antenna_m
     estimate = history.estimate(estimator.weights.detector.classes, [], ())
-    scores = score(estimate, recording, antenna_m=estimator.gnss.antenna_places, aligned=local)
-    alone = baselines(
-        recording, estimate, scores, recording.gnss, wheel_radius_m=rig.wheel_radius_m, track_m=rig.track_m,
-        antenna_m=antenna_m, aligned=local,
-    )  # fmt: skip
-    found = run_checks(recording, rig)
-    corrections = estimator.learned.corrections()
-    return judge(Run(recording, estimate, scores, alone, recording.gnss, found, rig, corrections))
+    return judged(recording, estimate, estimator, estimator.config.rig, recording.gnss)[2]
 
 
 @older_objects_unsearched()

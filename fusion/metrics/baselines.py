@@ -21,6 +21,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import ALIGN_M, Errors, align_start, known_keyframes
 from terrafusion.fusion.metrics.scores import Outage, Scores
@@ -70,9 +71,7 @@ def baselines(
     used: Gnss | None,
     outages: Sequence[Outage] = (),
     *,
-    wheel_radius_m: float,
-    track_m: float,
-    antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0),
+    rig: Rig,
     aligned: bool = False,
 ) -> Baselines:
     """Both baselines of a run, scored as `scores` were; `used` are the fixes the estimator was given.
@@ -84,8 +83,8 @@ def baselines(
         return Baselines()
     known, _ = known_keyframes(estimate)
     against_antenna = scores.against != "truth" or recording.truth_frame == "antenna"
-    lever = complex(antenna_m[0], antenna_m[1])
-    path = dead_reckoning(recording, wheel_radius_m, track_m)
+    lever = complex(*rig.sensors.gnss.antenna_m[:2])
+    path = dead_reckoning(recording, rig.wheel_radius_m, rig.track_m)
     reckoned = receiver = None
     if path is not None:
         point = lever if against_antenna else 0j

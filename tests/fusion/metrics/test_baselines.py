@@ -9,8 +9,10 @@ import pytest
 
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.metrics.baselines import Baselines, baselines, dead_reckoning
 from terrafusion.fusion.metrics.scores import Outage, score
+from terrafusion.twin.model.vehicle import load_vehicle
 
 REST_S, SPEED_MPS, TURN_RADPS, BIAS_RADPS = 5.0, 0.8, 0.05, 0.02
 TRACK_M = 0.5
@@ -34,7 +36,14 @@ def with_sensors(d, *, bias_radps: float = 0.0, gyro: bool = True, sides: bool =
 
 def compared(recording, d, used=None, outages=(), held_out=None) -> Baselines:
     scores = score(d.estimate, recording, held_out=held_out, outages=outages)
-    return baselines(recording, d.estimate, scores, used, outages, wheel_radius_m=0.2, track_m=TRACK_M)
+    return baselines(recording, d.estimate, scores, used, outages, rig=rig_with_antenna(0.0))
+
+
+def rig_with_antenna(forward_m: float) -> Rig:
+    rig = load_vehicle("elevate").rig()
+    gnss = dataclasses.replace(rig.sensors.gnss, antenna_m=(forward_m, 0.0, 0.0))
+    sensors = dataclasses.replace(rig.sensors, gnss=gnss)
+    return dataclasses.replace(rig, wheel_radius_m=0.2, track_m=TRACK_M, sensors=sensors)
 
 
 def test_exact_sensors_give_the_exact_path(drive):
@@ -99,9 +108,8 @@ def test_an_antenna_is_brought_to_the_reference(drive):
     arm = np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1)
     ahead = dataclasses.replace(d.fixes, enu_m=d.fixes.enu_m + arm)
     scores = score(d.estimate, recording, antenna_m=(1.0, 0.0, 0.0))
-    given = {"wheel_radius_m": 0.2, "track_m": TRACK_M}
-    assert baselines(recording, d.estimate, scores, ahead, antenna_m=(1.0, 0.0, 0.0), **given).gnss_m < 0.1
-    assert baselines(recording, d.estimate, scores, ahead, **given).gnss_m > 0.9
+    assert baselines(recording, d.estimate, scores, ahead, rig=rig_with_antenna(1.0)).gnss_m < 0.1
+    assert baselines(recording, d.estimate, scores, ahead, rig=rig_with_antenna(0.0)).gnss_m > 0.9
 
 
 def test_without_a_reference_nothing_is_scored(drive):
