@@ -1,13 +1,12 @@
 """`terrafusion completion bash|zsh|fish`: the script by which a shell completes commands and options."""
 
 import os
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from terrafusion.fusion.cli.command import Result
 
-SHELLS = ("bash", "zsh", "fish")
 VARIABLE = "_TERRAFUSION_COMPLETE"
 """Variable of the environment by which the script asks the program itself."""
 
@@ -20,7 +19,10 @@ def answer_shells() -> None:
         completion_init()
 
 
-def completion(shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")]) -> Result:
+ShellArgument = Annotated[Literal["bash", "zsh", "fish"], typer.Argument(help="That is used.")]
+
+
+def completion(shell: ShellArgument) -> Result:
     """Print the script that completes commands and options in a shell.
 
     Example: terrafusion completion bash >> ~/.bashrc
@@ -31,7 +33,5 @@ def completion(shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")])
     """
     from typer.completion import get_completion_script
 
-    if shell not in SHELLS:
-        raise typer.BadParameter(f"'{shell}' is none of {', '.join(SHELLS)}", param_hint="SHELL")
     script = get_completion_script(prog_name="terrafusion", complete_var=VARIABLE, shell=shell)
     return Result((), script)

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from terrafusion.datasets.checks.measures import RULER_SIGMAS
 from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.common import Line, styled
 
@@ -87,7 +86,7 @@ def clock_table(channels: dict[str, Any], head: str = "channel") -> Iterator[Lin
             "-" if not rate or not sampled else _spread(rate, ".4g") if pooled else f"{rate:.4g}",
             f"{c['recordings']}" if pooled else f"{c['start_s']:.1f} to {c['end_s']:.1f}",
             str(c["gaps"]) if sampled else "-",
-            f"{gap:.{0 if gap > 10 else 1}f}" if c["gaps"] and sampled else "-",
+            f"{gap:{'.2g' if gap < 100.0 else '.0f'}}" if c["gaps"] and sampled else "-",
         ])  # fmt: skip
     yield "", ""
     for number, line in enumerate(text_table(heads, rows, right=range(1, len(heads)))):
@@ -118,6 +117,8 @@ def _words(counts: dict[str, int]) -> str:
 
 def measured_texts(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """What is measured between the channels: a word and a text each."""
+    from terrafusion.datasets.checks.measures import RULER_SIGMAS
+
     gravity, yaw, sigma = measured["gravity"], measured["yaw"], measured["sigma_m"]
     if gravity:
         vector = ", ".join(f"{value:.2f}" for value in gravity["mean_mps2"])

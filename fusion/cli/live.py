@@ -29,7 +29,7 @@ def live(
     log: LogArgument = None,
     vehicle: common.VehicleOption = None,
     realtime: bool = False,
-    mode: str = "adaptive",
+    mode: common.Mode = "adaptive",
     topic: common.TopicOption = None,
     stamps: common.StampsOption = "header",
     domain: int | None = None,
@@ -58,7 +58,7 @@ def live(
 
     Args:
         realtime: At the pace of the recording.
-        mode: adaptive, fixed, robust or innovation, as of `replay`.
+        mode: As of `replay`.
         domain: DDS domain; by default ROS_DOMAIN_ID, else 0.
         loopback: Speak to this machine only (127.0.0.1).
         reliable: Ask for lost messages again; by default as ROS 2's sensor data.
@@ -74,10 +74,9 @@ def live(
     from terrafusion.fusion.live.node import LiveOptions
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
-    common.check_mode(mode)
     origin = common.parse_point(datum, "LAT,LON,HEIGHT", "--datum")
     options = LiveOptions(
-        vehicle, mode, common.parse_topics(topic), common.check_stamps(stamps), frequency=rate, datum=origin,
+        vehicle, mode, common.parse_topics(topic), stamps, frequency=rate, datum=origin,
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
         terrain_model=None if terrain_model is None else load_terrain_model(terrain_model),
     )  # fmt: skip

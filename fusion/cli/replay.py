@@ -49,7 +49,7 @@ DeclinationOption = Annotated[
 def replay(
     log: common.LogArgument,
     out: Path,
-    mode: str = "adaptive",
+    mode: common.Mode = "adaptive",
     vehicle: common.VehicleOption = None,
     policy: Path | None = None,
     batch: bool = False,
@@ -93,7 +93,6 @@ def replay(
     from terrafusion.fusion.reports.rerun_log import require_rerun
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
-    common.check_mode(mode)
     if rerun is not None:
         require_rerun()
     turned = None if declination is None else math.radians(declination)

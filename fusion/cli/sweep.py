@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -32,7 +32,7 @@ def sweep(
     max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html.")] = True,
     recordings: list[str] | None = None,
-    recordings_format: str = "folder",
+    recordings_format: Literal["folder", "mcap"] = "folder",
 ) -> Result:
     """Run a scenario over friction, terrain, slope, payload, speed and seeds.
 
@@ -51,10 +51,6 @@ def sweep(
     from terrafusion.twin.sweep.run import run_sweep
 
     common.check_backend(backend, address)
-    if recordings_format not in ("folder", "mcap"):
-        raise typer.BadParameter(
-            f"'{recordings_format}' is neither 'folder' nor 'mcap'", param_hint="--recordings-format"
-        )
     plan = load_sweep(sweep)
     chosen = _numbers(recordings or [], plan)
     check_runs(plan, chosen)

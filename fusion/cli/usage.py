@@ -49,7 +49,7 @@ def usage_line(error: Any) -> str:
     context = error.ctx
     if context is None:
         return str(error.format_message())
-    text = error.format_message()
+    text = error.format_message().replace("Value error, ", "").rstrip(".")
     if type(error).__name__ == "NoSuchOption":
         parameters = context.command.get_params(context)
         known = [name for one in parameters for name in (*one.opts, *one.secondary_opts) if name[0] == "-"]

@@ -33,7 +33,6 @@ from terrafusion.fusion.replay import ReplayResult
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 SCHEMA = "terrafusion.replay/1"
-MODES = ("adaptive", "fixed", "robust", "innovation")
 
 
 def metrics_of(result: ReplayResult) -> dict[str, Any]:
@@ -41,12 +40,7 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
 
     `calibration` has rows of `linear_states.calibration` where it was asked for, else of `learned_rows`; the
     notes on the scoring follow those of the estimate.
-
-    Raises:
-        ValueError: a mode not in `MODES`.
     """
-    if result.mode not in MODES:
-        raise ValueError(f"mode is '{result.mode}', not one of {', '.join(MODES)}")
     estimate, scores, verdict = result.estimate, result.scores, result.verdict
     latencies = np.asarray(result.latencies_ms, dtype=float).ravel()
     latencies = latencies[np.isfinite(latencies)]
