@@ -107,19 +107,38 @@ def replay(
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
     """
-    drive = _prepare(recording, vehicle, mode, policy, outages, magnetometer, settings, grounds)
-    estimator, estimate, seconds, latencies_ms = _run_estimator(drive, batch, progress, watch)
+    wheels_of(recording)  # refused before a vehicle is asked for
+    params, vehicle_notes = choose_vehicle(recording, vehicle)
+    used, held_out = split_fixes(recording, outages)
+    noise = policy if isinstance(policy, Policy) else load_policy(policy)
+    inputs = sensor_config_of(recording, used)
+    given = with_usable_samples(recording, inputs, used, magnetometer)
+    config = EstimatorConfig(
+        params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {})
+    )
+    assumed = assumptions(recording, vehicle or recording.vehicle, params, inputs, used)
+    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig))
+
+    estimator, history, run_notes, seconds, latencies_ms = _run_estimator(
+        config, given, batch, progress, watch
+    )
+    notes += (*run_notes, *notes_of(estimator))
+    if recording.magnetometer is not None and not magnetometer:
+        notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
+    changes = [*history.changes, *estimator.weights.take_changes()]
+    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
+
+    outages = tuple(outages)
     scores, alone, verdict = judged(
-        recording, estimate, estimator, drive.config.rig, drive.used, drive.held_out, drive.outages, findings
+        recording, estimate, estimator, config.rig, used, held_out, outages, findings
     )
     learned_grounds = estimator.weights.learned_grounds()
     if learned_grounds is not None and not learned_grounds.robot:
-        learned_grounds.robot = drive.vehicle.name
+        learned_grounds.robot = params.name
     return ReplayResult(
-        recording, drive.vehicle, mode, drive.config.policy, estimate, scores, drive.used, drive.held_out,
-        drive.outages, seconds, latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected,
-        alone, verdict, drive.assumed, estimator.learned.table(), learned_grounds,
-        estimator.weights.found_shares(),
+        recording, params, mode, config.policy, estimate, scores, used, held_out, outages, seconds,
+        latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, alone, verdict, assumed,
+        estimator.learned.table(), learned_grounds, estimator.weights.found_shares(),
     )  # fmt: skip
 
 
@@ -146,69 +165,19 @@ def judged(
     return scores, alone, judge(Run(recording, estimate, scores, alone, used, found, rig, corrections))
 
 
-@dataclass(frozen=True, eq=False)
-class _Drive:
-    """A recording as the estimator gets it, and what is held out for the scores.
-
-    `given` has complete samples only; `notes` and `unused` are reported of the inputs, before and
-    after the notes of the run.
-    """
-
-    recording: Recording
-    given: Recording
-    vehicle: VehicleParams
-    config: EstimatorConfig
-    used: Gnss | None
-    held_out: Gnss | None
-    outages: tuple[Outage, ...]
-    assumed: tuple[Assumption, ...]
-    notes: tuple[str, ...]
-    unused: tuple[str, ...]
-
-
-def _prepare(
-    recording: Recording,
-    vehicle: str | Path | VehicleParams | None,
-    mode: str,
-    policy: str | Path | Policy | None,
-    outages: Sequence[Outage],
-    magnetometer: bool,
-    settings: EstimatorOptions | None,
-    grounds: GroundMemory | None,
-) -> _Drive:
-    """Choose the robot and the noise, and split the fixes into those used and those held out."""
-    wheels_of(recording)  # refused before a vehicle is asked for
-    params, vehicle_notes = choose_vehicle(recording, vehicle)
-    used, held_out = split_fixes(recording, outages)
-    noise = policy if isinstance(policy, Policy) else load_policy(policy)
-    inputs = sensor_config_of(recording, used)
-    given = with_usable_samples(recording, inputs, used, magnetometer)
-    config = EstimatorConfig(
-        params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {})
-    )
-    assumed = assumptions(recording, vehicle or recording.vehicle, params, inputs, used)
-    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig))
-    unused: tuple[str, ...] = ()
-    if recording.magnetometer is not None and not magnetometer:
-        unused = ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
-    return _Drive(
-        recording, given, params, config, used, held_out, tuple(outages), assumed, notes, unused
-    )  # fmt: skip
-
-
 def _run_estimator(
-    drive: _Drive,
+    config: EstimatorConfig,
+    given: Recording,
     batch: bool,
     progress: Callable[[float], None] | None,
     watch: Callable[[Estimator], None] | None,
     level: ImuLevel | None = None,
-) -> tuple[Estimator, Estimate, float, Array]:
-    """Feed the samples as live; for a batch, then smooth the whole run.
+) -> tuple[Estimator, History, tuple[str, ...], float, Array]:
+    """Feed complete samples as live; for a batch, then smooth the whole run.
 
-    Gives the computing time in all, s, and by keyframe, ms, too. A batch in which the IMU proves tilted
-    begins again with its samples levelled, by `level`.
+    Gives notes on the alignment, and computing time in all, s, and by keyframe, ms, too. A batch in which the
+    IMU proves tilted begins again with its samples levelled, by `level`.
     """
-    config = drive.config
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
 
     def keyframe(state: State) -> None:
@@ -222,17 +191,14 @@ def _run_estimator(
     if level is not None:
         estimator.learned.mounting.level.hold(level.known, level.corrects)
     started = time.perf_counter()
-    latencies_ms = feed(estimator, drive.given, progress)
+    latencies_ms = feed(estimator, given, progress)
     found = estimator.learned.mounting.level
     if batch and level is None and any(found.corrects):
-        return _run_estimator(drive, batch, None, watch, found)
+        return _run_estimator(config, given, batch, None, watch, found)
     alignment_notes = history.align(estimator.gnss.alignment, batch)
     if archive is not None and history.states:
         history.smooth(archive, estimator.config, estimator.gnss, estimator.learned)
     seconds = time.perf_counter() - started
     if not history.states:
-        raise never_started(drive.given, drive.config.rig.wheel_radius_m)
-    notes = (*drive.notes, *alignment_notes, *notes_of(estimator), *drive.unused)
-    changes = [*history.changes, *estimator.weights.take_changes()]
-    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
-    return estimator, estimate, seconds, latencies_ms
+        raise never_started(given, config.rig.wheel_radius_m)
+    return estimator, history, alignment_notes, seconds, latencies_ms

@@ -19,7 +19,7 @@ def answer_shells() -> None:
         completion_init()
 
 
-ShellArgument = Annotated[Literal["bash", "zsh", "fish"], typer.Argument(help="That is used.")]
+ShellArgument = Annotated[Literal["bash", "zsh", "fish"], typer.Argument(help="Shell to write it for.")]
 
 
 def completion(shell: ShellArgument) -> Result:
