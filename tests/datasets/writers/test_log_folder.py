@@ -145,7 +145,7 @@ def test_a_writer_that_fails_leaves_what_was_there(
 
 UNWRITABLE = {
     "infinite": ({"imu": Imu(np.zeros(1, np.int64), np.full((1, 3), np.inf), np.ones((1, 3)))}, "infinite"),
-    "far": ({"imu": Imu(np.array([2 * 10**18]), np.ones((1, 3)), np.ones((1, 3)))}, "start_ns"),
+    "far": ({"imu": Imu(np.array([2 * 10**18]), np.ones((1, 3)), np.ones((1, 3)))}, "onto one clock"),
     "zero byte": ({"terrain": Terrain(np.zeros(1, np.int64), np.array(["a\0b"], dtype=object))}, "zero byte"),
     "half a character": (
         {"terrain": Terrain(np.zeros(1, np.int64), np.array(["\ud800"], dtype=object))},
