@@ -120,10 +120,6 @@ class Catalog:
         digest = sha256_of(path)
         return next((entry for entry in same_size if entry.sha256 == digest), None)
 
-    def of_format(self, name: str) -> DataSet | None:
-        """The set whose files have the format `name`, where one set has its own format."""
-        return next((s for s in self.sets.values() if s.format == name), None)
-
     def recordings(self) -> dict[str, list[CatalogFile]]:
         """Files of every recording, by `set/recording`."""
         found: dict[str, list[CatalogFile]] = {}

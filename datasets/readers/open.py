@@ -158,7 +158,7 @@ def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, t
     if entry is not None:
         known = catalog.sets[entry.set_name]
         return entry, known.conventions_of(entry.recording), known.notes_of(entry.recording)
-    same = catalog.of_format(form.name)
+    same = next((s for s in catalog.sets.values() if s.format == form.name), None)
     if same is None:
         return None, Conventions(), ()
     note = f"this file is not in the catalogue; read with the conventions of {same.name}: check the findings"
