@@ -268,6 +268,10 @@ class Steering(Channel):
     def columns(self) -> dict[str, NDArray[Any]]:
         return {f"{name}_rad": self.angle_rad[:, i] for i, name in enumerate(self.names)}
 
+    def drive(self) -> str:
+        """The drive that the angles suggest."""
+        return "four_wheel_steer" if self.axle_angles_rad()[:, 1].any() else "ackermann"
+
     def axle_angles_rad(self, steering_ratio: float = 1.0) -> Array:
         """Mean angle (N, 2) of front and rear wheels, rad; `steering_ratio` is used for a steering wheel."""
         return messages.axles(self.angle_rad, self.names, steering_ratio)

@@ -62,8 +62,7 @@ def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> Draft
     if recording.overrides.drive is not None:
         return DraftLine(recording.overrides.drive, STATED)
     if recording.steering is not None:
-        rear = bool(recording.steering.axle_angles_rad()[:, 1].any())
-        return DraftLine("four_wheel_steer" if rear else "ackermann", "the log has steering angles")
+        return DraftLine(recording.steering.drive(), "the log has steering angles")
     return DraftLine(base.drive.type, f"assumed, as of '{base.name}'; else give {FLAGS['drive']}")
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafusion.datasets.core.channels import Steering
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Overrides, Recording
@@ -38,7 +37,7 @@ def choose_vehicle(
     """
     asked, overrides = vehicle, recording.overrides
     if overrides.drive is None and recording.steering is not None:
-        overrides = dataclasses.replace(overrides, drive=_drive_of(recording.steering))
+        overrides = dataclasses.replace(overrides, drive=recording.steering.drive())
     asked = asked or named_vehicle(recording)
     if asked:
         loaded = as_vehicle(asked)
@@ -81,11 +80,6 @@ def named_vehicle(recording: Recording) -> str | None:
         remedy = "correct the path in its meta.yaml, or give --vehicle FILE"
         raise ConfigError(what, file=recording.name, remedy=remedy)
     return name
-
-
-def _drive_of(steering: Steering) -> str:
-    """The drive that steering angles suggest."""
-    return "four_wheel_steer" if steering.axle_angles_rad()[:, 1].any() else "ackermann"
 
 
 def _missing_geometry(recording: Recording, overrides: Overrides) -> list[str]:
