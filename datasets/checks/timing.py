@@ -201,7 +201,7 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
             evidence = f"its last sample is at t = {context.since_start_s(channel.t_ns[-1]):.2f} s"
         else:
             continue
-        fix = "expect larger uncertainty there, and look for dropped messages: what is missing is unknown"
+        fix = "expect larger uncertainty there, and look for dropped messages or a clock that was set ahead"
         yield Finding("gaps", "warning", name, what, evidence, fix)
 
 

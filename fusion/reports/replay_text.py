@@ -69,6 +69,10 @@ class ScoreRow:
         """The number of run `i` as shown."""
         return number(self.values[i])
 
+    def baseline_text(self, k: int) -> str:
+        """The number of a baseline as shown."""
+        return number(self.baselines[k])
+
     def _cost(self, value: float | None) -> float | None:
         if value is None or self.goal != "one":
             return value
@@ -149,8 +153,11 @@ def tiles(rows: Sequence[ScoreRow], names: Sequence[str], ours: int) -> list[Til
 
 def _beside(row: ScoreRow, names: Sequence[str], ours: int) -> str:
     others = [f"{name} {row.text(i)}" for i, name in enumerate(names) if i != ours]
-    beside = zip(BASELINES.values(), row.baselines, strict=True)
-    others += [f"{name} {number(value)}" for name, value in beside if value is not None]
+    others += [
+        f"{name} {row.baseline_text(k)}"
+        for k, name in enumerate(BASELINES.values())
+        if row.baselines[k] is not None
+    ]
     aim = ["1 is consistent"] if row.goal == "one" else []
     return "; ".join([*([names[ours]] if len(names) > 1 else []), *others, *aim])
 

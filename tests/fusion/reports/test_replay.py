@@ -15,6 +15,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss, Terrain
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
+from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.scores import Outage, score
 from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.reports.plots import replay as plots
@@ -115,6 +116,13 @@ def test_one_run_needs_no_comparison(drive, tmp_path):
     assert "against fixed" not in text
     assert "★ best" not in text
     assert "Without GNSS for 30 s from 40 s the position was" in text
+
+
+def test_baselines_stand_beside_the_errors(drive, tmp_path):
+    beside = Baselines(dead_reckoning_m=1.25, gnss_m=3.75)
+    run = dataclasses.replace(make_run(drive(), "adaptive"), baselines=beside)
+    text = write_report(tmp_path / "r.html", "Replay", [run]).read_text(encoding="utf-8")
+    assert all(f'<td class="n">{value}</td>' in text for value in ("1.25", "3.75"))
 
 
 def test_what_comes_from_a_log_is_escaped(drive, tmp_path):
