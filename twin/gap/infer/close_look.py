@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,13 +37,15 @@ PAIRS, FIRST = 30, 5
 @dataclass(frozen=True, eq=False)
 class CloseLook:
     """Laws examined, by index; columns of the discrepancy of each in the metric, and the norm of its values
-    for which these are."""
+    for which these are. `may_be_old` tells of one, by index, and a size whether references
+    may hold it."""
 
     metric: Metric
     laws: Laws
     index: tuple[int, ...]
     extra: Mapping[int, Array]
     size: Mapping[int, float]
+    may_be_old: Callable[[int, float], bool]
 
     def fit(self, laws: Sequence[int]) -> Fitted:
         """Some laws together, with the discrepancy of each, in proportion to its size, in the covariance.
@@ -84,8 +86,9 @@ class CloseLook:
         """Fits of all laws alone and of the pairs that look promising.
 
         A second law counts only where it explains most of what the first leaves: a law that is not quite the
-        robot's leaves something of the shape of no law, a part of which any other explains. The evidence of
-        both is then that of the first.
+        robot's leaves something of the shape of no law, a part of which any other explains. Nor does one that
+        references may hold count beside one that has changed. The evidence of both is then that of the other
+        alone.
         """
         found: dict[tuple[int, ...], Fitted] = {(i,): self.fit((i,)) for i in self.index}
         best = sorted(self.index, key=lambda i: -found[i,].evidence)[:FIRST]
@@ -95,8 +98,13 @@ class CloseLook:
         for pair in sorted(pairs):
             both, first = self.fit(pair), min(pair, key=lambda i: found[i,].left)
             if both.left <= LEFT * found[first,].left:
-                found[pair] = both
-            elif both.evidence > found[first,].evidence:
+                sizes = zip(pair, both.values, strict=True)
+                new = [i for i, v in sizes if not self.may_be_old(i, float(v[0]))]
+                if len(new) != 1:
+                    found[pair] = both
+                    continue
+                (first,) = new
+            if both.evidence > found[first,].evidence:
                 found[first,] = dataclasses.replace(found[first,], evidence=both.evidence)
         return found
 

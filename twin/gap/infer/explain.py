@@ -21,6 +21,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
+from terrafusion.twin.gap.infer.not_new import ReferenceCheck
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, excess, metric
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
@@ -210,11 +211,16 @@ def _close_look(
     size = {i: float(np.linalg.norm(values[i])) for i in index}
     normal = own.normal_energies()
     plain = list[Products]()
+    check = ReferenceCheck(bank, evidence)
+
+    def may_be_old(i: int, size: float) -> bool:
+        return check.may_be_old(look.laws.names[i], size)
+
     for _ in range(WEIGHINGS):
         runs, extra = products_with_discrepancy(evidence.runs, evidence.model, bank, wanted, weight)
         plain, look = plain or runs, own.look(bank, runs)
         laws = look.laws
-        found = CloseLook(look.metric, laws, index, extra, size).search()
+        found = CloseLook(look.metric, laws, index, extra, size, may_be_old).search()
         top = max(found, key=lambda some: found[some].evidence - 5.0 * len(some))
         before, weight = weight, own.weights(look, found[top], normal)
         if np.allclose(before, weight, rtol=0.1):
