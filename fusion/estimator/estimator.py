@@ -90,7 +90,8 @@ class Estimator:
         on_innovation: Callable[[Innovation], None] | None = None,
         archive: Chain | None = None,
     ) -> None:
-        rig, policy = checked_config(config).inputs.rig(config.rig), policy_of(config.rig, config.policy)
+        inputs = checked_config(config).inputs
+        rig, policy = inputs.rig(config.rig), policy_of(config.rig, config.policy, inputs.yaw)
         self.config = dataclasses.replace(config, rig=rig, policy=policy)
         self._on_state, self._on_innovation, self.breakdowns = on_state, on_innovation, 0
         self.reset(archive)

@@ -13,8 +13,10 @@ import math
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.robot import SKIDDING
 from terrafusion.datasets.core.sensors import Rig, SteeringSpec
-from terrafusion.fusion.config.sensor_config import SensorConfig
+from terrafusion.fusion.config.assumptions import YAW_FACTOR_SIGMA
+from terrafusion.fusion.config.sensor_config import SensorConfig, yaw_factor
 from terrafusion.fusion.graph.key_state import BIAS
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.steering import SteeringStream
@@ -31,6 +33,8 @@ WANDER_SHARE = 0.1
 TYRE_SLIP_PER_GRADE = 0.05
 """Slip over the grade of tyres on firm ground, where most steered robots drive: half the grip takes some two
 per cent of slip (assumed)."""
+STEERED_SIGMA = 0.02
+"""1 sigma of the scale of a steered robot's turn (assumed)."""
 LEAST_M = 0.02
 """Distance a keyframe below which nothing is learned."""
 
@@ -41,19 +45,26 @@ def front_ratio(rig: Rig) -> float:
     return known if known is not None else WHEEL_RATIO
 
 
-def policy_of(rig: Rig, policy: Policy) -> Policy:
-    """The policy for a robot that does not skid to turn: its wheels' yaw needs no scale, and on ground that
-    no class describes its tyres slip little on a grade.
+def policy_of(rig: Rig, policy: Policy, yaw: str = "gyro") -> Policy:
+    """The policy for a robot that does not skid to turn, or whose `yaw_factor` is known: its turns have no
+    scale, or that one. On ground of no class, tyres of a steered robot slip little on a grade.
+
+    Args:
+        yaw: source of the yaw rate; where it is the wheels, their track holds the factor already.
     """
-    if rig.steering is None:
+    if rig.drive in SKIDDING and rig.known.yaw_factor is None:
         return policy
+    steered = rig.steering is not None
+    scale = 0.0 if steered or yaw == "wheels" else yaw_factor(rig) - 1.0
+    sigma = STEERED_SIGMA if steered else YAW_FACTOR_SIGMA
 
-    def steered(noise: SensorNoise) -> SensorNoise:
-        return dataclasses.replace(noise, yaw_scale_mean=0.0, yaw_scale_sigma=0.02)
+    def turning(noise: SensorNoise) -> SensorNoise:
+        return dataclasses.replace(noise, yaw_scale_mean=scale, yaw_scale_sigma=sigma)
 
-    classes = {name: steered(noise) for name, noise in policy.classes.items()}
-    per_grade = min(policy.fixed.slip_per_grade, TYRE_SLIP_PER_GRADE)
-    fixed = dataclasses.replace(steered(policy.fixed), slip_per_grade=per_grade)
+    classes = {name: turning(noise) for name, noise in policy.classes.items()}
+    fixed = turning(policy.fixed)
+    if steered:
+        fixed = dataclasses.replace(fixed, slip_per_grade=min(fixed.slip_per_grade, TYRE_SLIP_PER_GRADE))
     return dataclasses.replace(policy, classes=classes, fixed=fixed)
 
 

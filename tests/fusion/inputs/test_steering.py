@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import SteeringSample
 from terrafusion.datasets.core.recording import Overrides
+from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.sensors import Rig, SteeringSpec
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig, sensor_config_of
@@ -110,6 +111,28 @@ def test_tyres_slip_little_on_a_grade_unless_the_ground_is_known() -> None:
     assert changed.slips()[2] == pytest.approx(policy.slips()[2])
     firm = dataclasses.replace(policy, fixed=dataclasses.replace(policy.fixed, slip_per_grade=0.01))
     assert policy_of(rig(), firm).fixed.slip_per_grade == 0.01
+
+
+@pytest.mark.parametrize(
+    ("drive", "known", "yaw", "scale"),
+    [
+        ("differential", None, "gyro", 0.0),
+        ("differential", 0.9, "gyro", -0.1),
+        ("differential", 0.9, "wheels", 0.0),
+        ("skid_steer", 0.7, "gyro", -0.3),
+        ("ackermann", None, "gyro", 0.0),
+    ],
+)
+def test_wheels_that_do_not_skid_or_are_known_turn_the_robot_by_their_factor(
+    drive: str, known: float | None, yaw: str, scale: float
+) -> None:
+    """The track of wheels that are the source of yaw holds the factor already."""
+    factor = None if known is None else KnownNumber(known, "measured")
+    plain = load_vehicle("elevate").rig()
+    robot = dataclasses.replace(plain, drive=drive, known=dataclasses.replace(plain.known, yaw_factor=factor))
+    for noise in (*(changed := policy_of(robot, load_policy(), yaw)).classes.values(), changed.fixed):
+        assert noise.yaw_scale_mean == pytest.approx(scale)
+        assert noise.yaw_scale_sigma == 0.15
 
 
 def test_a_steering_wheel_is_divided_by_its_ratio() -> None:
