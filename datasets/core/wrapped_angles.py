@@ -73,7 +73,7 @@ def _rolled_over(steps: Array, range_rad: float) -> Array:
     if np.isnan(near).all(axis=0).any():
         return lost
     beside = np.nanmean(near, axis=0)
-    if (beside * steps[rows] < 0.0).all():
+    if (np.sign(beside) == -np.sign(steps[rows])).all():
         lost[rows] = beside - steps[rows]
     return lost
 

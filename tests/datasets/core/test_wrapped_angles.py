@@ -56,7 +56,8 @@ def test_a_counter_that_rolls_over_goes_on(range_rad: float) -> None:
     np.r_[np.linspace(0.0, 50.0, 99), 0.0, np.linspace(50.5, 99.0, 99)],
     np.r_[np.linspace(0.0, 20.0, 99), np.linspace(95.0, 99.0, 99)],
     np.r_[np.full(50, 0.0), 9.0, np.full(50, 0.0)],
-], ids=["an outlier", "a gap", "one jolt"])  # fmt: skip
+    np.array([0.0, 2.0, 8.98846567e307]),
+], ids=["an outlier", "a gap", "one jolt", "the largest numbers"])  # fmt: skip
 def test_other_steps_are_no_counter_that_rolls_over(angle: np.ndarray) -> None:
     assert unwrapped(angle[:, None], ("left",))[1] == ""
 
