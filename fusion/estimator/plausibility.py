@@ -18,7 +18,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Complex
 from terrafusion.datasets.core.planar_alignment import planar_rotation
-from terrafusion.datasets.core.printable import times
+from terrafusion.datasets.core.printable import counted, times
 from terrafusion.fusion.estimate.estimate import JUMPED, State
 from terrafusion.fusion.estimator.dead_reckoning import (
     LEAST_TURN_RAD,
@@ -291,7 +291,8 @@ class FixPlausibility:
 
     def notes(self) -> list[str]:
         """What was made of the fixes, in sentences."""
-        out = [f"{count} GNSS fixes were not used: {why}" for why, count in self.unused.items() if count]
+        unused = [(counted(n, "GNSS fix", "GNSS fixes"), why) for why, n in self.unused.items() if n]
+        out = [f"{fixes} not used: {why}" for fixes, why in unused]
         if self.jumps:
             out.append(
                 f"{self.jumps} times fixes beyond reach traced the path of wheels and gyro for so long that "
