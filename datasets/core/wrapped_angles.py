@@ -54,7 +54,7 @@ def unwrapped(angle_rad: Array | None, names: tuple[str, ...]) -> tuple[Array | 
     notes = [f"the angles of {', '.join(wrapped)} start again after each turn; whole turns are counted"]
     if rolled:
         what = f"the counters of {', '.join(rolled)} roll over, or were reset"
-        notes = [*(notes if wrapped else []), f"{what}; there the wheel's speed is taken from beside"]
+        notes = [*(notes if wrapped else []), f"{what}; the step there is taken to be as those beside it"]
     return out, "; ".join(notes) if wrapped or rolled else ""
 
 

@@ -264,7 +264,8 @@ def _check_table(table: OutputTable, start_ns: int, folder: Path, channel: str) 
             f"time {far[0]} ns is {abs(far[0] - int(start_ns)) / 1e9:.3g} s from start_ns",
             file=folder,
             channel=channel,
-            remedy="bring all channels onto one clock: a file without calendar times begins in 1970",
+            remedy=f"bring all channels onto one clock, within {MAX_T_S:g} s of start_ns; a file without "
+            "calendar times begins in 1970",
         )
 
 

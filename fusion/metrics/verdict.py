@@ -241,7 +241,7 @@ def _certain(run: Run) -> Iterator[Reason]:
         )
     yaw_sigma = float(np.sqrt(path.covariance[-1, 5, 5]))
     if yaw_sigma > YAW_SIGMA_KNOWN_RAD:
-        why = "drive on" if run.used is not None else "without fixes nothing corrects it"
+        why = "drive on" if run.used else "without fixes nothing corrects it"
         yield doubtful(f"the heading is unknown at the end: {np.degrees(yaw_sigma):.0f} deg (1 sigma); {why}")
 
 

@@ -37,8 +37,7 @@ PAIRS, FIRST = 30, 5
 @dataclass(frozen=True, eq=False)
 class CloseLook:
     """Laws examined, by index; columns of the discrepancy of each in the metric, and the norm of its values
-    for which these are. `may_be_old` tells of one, by index, and a size whether references
-    may hold it."""
+    for which these are. `may_be_old` tells of a law, by index, and a size whether references may hold it."""
 
     metric: Metric
     laws: Laws

@@ -21,9 +21,9 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
 from terrafusion.twin.gap.infer.close_look import CloseLook, products_with_discrepancy
 from terrafusion.twin.gap.infer.detection import UNKNOWN_SIZES
-from terrafusion.twin.gap.infer.not_new import ReferenceCheck
 from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import Metric, Products, energies, excess, metric
+from terrafusion.twin.gap.infer.reference_check import ReferenceCheck
 from terrafusion.twin.gap.infer.single_effects import Fitted, Laws
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.rollout.residuals import soil_columns

@@ -6,7 +6,7 @@ import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.bank import SignatureBank, SimulatedSize, model_soil
-from terrafusion.twin.gap.infer.not_new import ReferenceCheck
+from terrafusion.twin.gap.infer.reference_check import ReferenceCheck
 from terrafusion.twin.gap.null.evidence import gather_evidence
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs

@@ -16,8 +16,9 @@ from terrafusion.twin.gap.infer.bank import INSENSITIVE, SignatureBank, Simulate
 from terrafusion.twin.gap.null.evidence import GapEvidence
 
 PRESENT = 0.25
-"""Share of a law, by least squares, from which references hold it (assumed): none of one that changed, all of
-one that the robot always had, if the twin knew its size and all else."""
+"""Share of a law, by least squares, from which references hold it (assumed, with one robot of another
+simulator in view): none of one that changed, all of one that the robot always had, if the twin knew its size
+and all else."""
 
 
 @dataclasses.dataclass(eq=False)
