@@ -22,7 +22,7 @@ from terrafusion.twin.gap.data.threads import one_blas_thread
 from terrafusion.twin.gap.infer.detection import detect
 from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
-from terrafusion.twin.gap.infer.other_drives import FEWEST, SCATTER_SCALES, learn_offsets
+from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets
 from terrafusion.twin.gap.infer.run_states import learn_state_sigma
 from terrafusion.twin.gap.null.drives import drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
@@ -108,10 +108,9 @@ def diagnose_evidence(
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
-        in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
+        in_common = learn_offsets(normal, len(candidates.keys), of_twin=True).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
-    scales = SCATTER_SCALES[-1:] if uncalibrated else SCATTER_SCALES
-    offsets = learn_offsets(normal, len(candidates.keys), scales, evidence.jobs)
+    offsets = learn_offsets(normal, len(candidates.keys), evidence.jobs, of_twin=uncalibrated)
     planner = Planner.of(evidence, sigma, offsets, scores)
     judged, robot = evidence, offsets
     if not uncalibrated:

@@ -33,6 +33,11 @@ may be as wrong on others."""
 EM_STEPS, MISFIT_STEPS = 8, 3
 MISFIT_SCATTER = 0.1  # prior 1 sigma from run to run of a coefficient of law misfit (assumed)
 CERTAIN = 3.0  # times its variance (assumed) that the square of a column must exceed to be no noise
+MATCHING_STEPS, MATCHED_PRIOR, FEWEST_MATCHED = 3, 12.0, 10
+"""Steps that match the scatter to the squares of scores, the weight, in runs, of those expected (assumed),
+and references from which: the variance of fewer is off by half of itself."""
+LEAST_SCATTER = 1e-3  # 1 sigma, in the columns' units
+LEAST_VARIANCE = 1e-12  # of the score of a column that no channel shows
 FEWEST = 3  # references from which a scatter can be learned
 
 
@@ -85,22 +90,47 @@ class RobotOffsets:
 
 
 def learn_offsets(
-    references: Sequence[Score], candidates: int, scales: Sequence[float] = SCATTER_SCALES, jobs: int = 1
+    references: Sequence[Score], candidates: int, jobs: int = 1, of_twin: bool = False
 ) -> RobotOffsets:
     """From references; fewer than `FEWEST` show no scatter. The first `candidates` columns are of effects.
 
     Args:
-        scales: factors of the prior scatter to choose from; replicates of the twin, which has none, show
-            nothing of it.
+        of_twin: these are replicates of the twin, which show nothing of how runs scatter.
     """
     first = _first_scatter(len(references[0].b), candidates)
     group = np.maximum(np.arange(len(first)) - candidates, -1) // len(BASIS)
     groups = [group == k for k in np.unique(group)]
-    prior = np.ones(len(first))
+    prior, scales = np.ones(len(first)), SCATTER_SCALES[-1:] if of_twin else SCATTER_SCALES
     found = in_threads(
         jobs, lambda scale: _learn(references, scale**2 * first, prior, EM_STEPS, groups), scales
     )
-    return max(found, key=lambda o: _log_likelihood(references, o.scatter, o.prior))
+    likeliest = max(found, key=lambda o: _log_likelihood(references, o.scatter, o.prior))
+    return likeliest if of_twin else _matched(references, likeliest)
+
+
+def _matched(references: Sequence[Score], offsets: RobotOffsets) -> RobotOffsets:
+    """With the scatter of which scores vary as those of references do that the others predict.
+
+    Many columns act alike, and noise that is not white looks like scatter of some: by likelihood alone, their
+    sum can be several times too large in a column that hardly varies. The scatter of each column is scaled
+    by the mean, over all scores to which it contributes, of the square over the expected one (Richardson
+    1972, JOSA 62, 55: the same for positive numbers of which sums are observed).
+    """
+    found = offsets
+    for _ in range(MATCHING_STEPS if len(references) >= FEWEST_MATCHED else 0):
+        square, shares = np.zeros(len(found.mean)), np.zeros_like(found.covariance)
+        for r, mean in zip(references, found.left_out(references), strict=True):
+            parts = r.A**2 * found.scatter  # of the variance of each score (P, P)
+            expected = parts.sum(axis=1) + np.diag(r.A) + ((r.A @ found.covariance) * r.A).sum(axis=1)
+            expected = np.maximum(expected, LEAST_VARIANCE)
+            square += (r.b - r.A @ mean) ** 2 / expected
+            shares += parts / expected[:, None]
+        ratio, whole = (MATCHED_PRIOR + square) / (MATCHED_PRIOR + len(references)), shares.sum(axis=0)
+        scale = np.divide(ratio @ shares, whole, out=np.ones(len(whole)), where=whole > LEAST_VARIANCE)
+        scatter = np.maximum(scale * found.scatter, LEAST_SCATTER**2)
+        mean, covariance, _ = _posterior(references, scatter, found.prior)
+        found = dataclasses.replace(found, mean=mean, covariance=covariance, scatter=scatter)
+    return found
 
 
 def first_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
@@ -161,7 +191,7 @@ def learn_misfit(
     count = len(references[0].b) - len(offsets.mean)
     first = np.append(offsets.scatter, np.full(count, MISFIT_SCATTER**2))
     prior = np.append(offsets.prior, np.full(count, sigma**2))
-    found = _learn(references, first, prior, MISFIT_STEPS, ())
+    found = _matched(references, _learn(references, first, prior, MISFIT_STEPS, ()))
     covariance = found.covariance + np.diag(changed)
     return dataclasses.replace(found, covariance=covariance, misfit=count, changed=changed)
 

@@ -106,7 +106,7 @@ def test_the_prior_of_an_offset_is_learned_of_effects_together_and_of_each_chann
     for _ in range(6):
         error = rng.standard_normal(ROWS) + J @ sizes
         references.append(Score(J.T @ error, J.T @ J))
-    offsets = learn_offsets(references, effects)
+    offsets = learn_offsets(references, effects, of_twin=True)
     own, begin = offsets.mean**2 + np.diag(offsets.covariance), 0
     for size in (effects, *[len(BASIS)] * channels):
         mine = slice(begin, begin + size)
@@ -263,6 +263,34 @@ def test_references_show_how_alike_runs_are(scale: float) -> None:
         references.append(Score(J.T @ error, J.T @ J))
     found = np.sqrt(learn_offsets(references, len(CANDIDATES.keys)).scatter) / SCATTER
     assert np.median(found) == pytest.approx(scale, rel=0.25)
+
+
+@pytest.mark.parametrize("scatter", [0.03, CANDIDATE_SCATTER])
+def test_scores_of_columns_that_act_alike_vary_as_references_show(scatter: float) -> None:
+    """The prior scatter of ten such columns adds up to more than that of the score of any one."""
+    before, after = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        J = rng.standard_normal((ROWS, P))
+        J[:, :10] = J[:, :1] + 0.3 * J[:, :10]
+        size, robot, references = np.where(np.arange(P) < 10, scatter, SCATTER), rng.standard_normal(P), []
+        for _ in range(12):
+            error = rng.standard_normal(ROWS) + J @ (robot + size * rng.standard_normal(P))
+            references.append(Score(J.T @ error, J.T @ J))
+        for found, of_twin in ((before, True), (after, False)):
+            offsets = learn_offsets(references, len(CANDIDATES.keys), of_twin=of_twin)
+            found.append(_over_expected(references, offsets)[:10].mean())
+    assert np.median(after) == pytest.approx(1.0, abs=0.15)
+    assert abs(np.median(after) - 1.0) <= abs(np.median(before) - 1.0)
+
+
+def _over_expected(references: list[Score], offsets: RobotOffsets) -> np.ndarray:
+    """Root mean square (P,) of scores of references over that which the others predict."""
+    square = np.zeros(len(offsets.mean))
+    for r, mean in zip(references, offsets.left_out(references), strict=True):
+        S = r.A @ (offsets.covariance + np.diag(offsets.scatter)) @ r.A + r.A
+        square += (r.b - r.A @ mean) ** 2 / np.diag(S)
+    return np.sqrt(square / len(references))
 
 
 def test_the_likelihood_of_references_is_that_of_their_scores() -> None:
