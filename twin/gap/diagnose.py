@@ -108,7 +108,7 @@ def diagnose_evidence(
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
         notes.append(TOO_FEW.format(len(normal), FEWEST))
-        in_common = learn_offsets(normal, len(candidates.keys), of_twin=True).mean if normal else 0.0
+        in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
     offsets = learn_offsets(normal, len(candidates.keys), evidence.jobs, of_twin=uncalibrated)
     planner = Planner.of(evidence, sigma, offsets, scores)

@@ -34,8 +34,9 @@ EM_STEPS, MISFIT_STEPS = 8, 3
 MISFIT_SCATTER = 0.1  # prior 1 sigma from run to run of a coefficient of law misfit (assumed)
 CERTAIN = 3.0  # times its variance (assumed) that the square of a column must exceed to be no noise
 MATCHING_STEPS, MATCHED_PRIOR, FEWEST_MATCHED = 3, 12.0, 10
-"""Steps that match the scatter to the squares of scores, the weight, in runs, of those expected (assumed),
-and references from which: the variance of fewer is off by half of itself."""
+"""Steps that match the scatter to the squares of scores, the weight, in runs, of those expected (both set
+with robots 105 to 128 of the study `unseen_gap` in view), and references from which: a variance that fewer
+show is uncertain by half of itself."""
 LEAST_SCATTER = 1e-3  # 1 sigma, in the columns' units
 LEAST_VARIANCE = 1e-12  # of the score of a column that no channel shows
 FEWEST = 3  # references from which a scatter can be learned
