@@ -6,12 +6,15 @@ least of them is compared with the least of replicates of the judged drives (Wes
 So a deviation that varies much on drives unlike the references' does not hide one that varies little.
 
 Scores are normal given how much wider than expected offsets scatter from run to run and change on other
-drives; both factors are unknown (Student 1908), and a tail probability is the mean over them.
+drives; both factors are unknown (Student 1908), and a tail probability is the mean over them. A scatter that
+has been matched to the squares of the references' scores is as uncertain as these are few: replicates repeat
+that.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -37,6 +40,9 @@ REPLICATES, LOWEST = 1000, 20
 FEWEST_AGREEING, AGREEING = 3, 0.5
 """Runs from which each is left out, and the factor on the p-value of the others, as fewer show less (set on
 two robots of the study `unseen_gap`, tried on two others)."""
+MATCHED_PRIOR = 2.0
+"""Weight, in references, of the mean square that a matching expects of a deviation (set on robots 107 and 124
+of the study `unseen_gap`)."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost
 GRID = np.geomspace(0.05, 3000.0, 80)  # squares over their mean, between which tails are interpolated
 
@@ -72,7 +78,9 @@ def _of_all(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates
         np.sum([(r.A * offsets.scatter) @ r.A for r in runs], axis=0)[:own, :own],
     ]
     deviations = Deviations.of(A[:own, :own], parts, float(offsets.references), candidates)
-    others = np.sort(deviations.least(_replicates(runs, A, offsets, np.random.default_rng(seed))[:, :own]))
+    rng = np.random.default_rng(seed)
+    replicates = _replicates(runs, A, offsets, rng)[:, :own]
+    others = np.sort(deviations.least(replicates, _matching_errors(runs, deviations, offsets, rng)))
     found = (np.sum([r.b for r in runs], axis=0) - A @ offsets.mean)[None, :own]
     least = float(deviations.least(found)[0])
     p_value = float((1 + np.count_nonzero(others <= least)) / (1 + len(others)))
@@ -84,10 +92,32 @@ def _of_all(runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates
 def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.random.Generator) -> Array:
     """Pooled scores (R, P) less their mean."""
     robot = drawn_robots(offsets, REPLICATES, rng)
-    values, vectors = np.linalg.eigh(A)
-    noise = rng.standard_normal((REPLICATES, len(A))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     scatter = drawn_scatter(offsets, len(runs), REPLICATES, rng)
-    return robot @ A + noise + sum(own @ r.A for own, r in zip(scatter, runs, strict=True))
+    return robot @ A + _drawn(A, rng) + sum(own @ r.A for own, r in zip(scatter, runs, strict=True))
+
+
+def _drawn(covariance: Array, rng: np.random.Generator) -> Array:
+    """Normal scores (R, P) of a covariance (P, P)."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.standard_normal((REPLICATES, len(covariance))) @ root.T)
+
+
+def _matching_errors(
+    runs: Sequence[Score], deviations: Deviations, offsets: RobotOffsets, rng: np.random.Generator
+) -> Array | float:
+    """Factors (R, D) by which a matching finds the mean squares of deviations too large: it takes those of as
+    many references, which drive as the judged runs do. One where the scatter has not been matched."""
+    if not offsets.matched:
+        return 1.0
+    own, count = len(deviations.maps), offsets.references
+    square, expected = np.zeros((REPLICATES, len(deviations.mean))), np.zeros(len(deviations.mean))
+    covariances = [((r.A * offsets.scatter) @ r.A + r.A)[:own, :own] for r in runs]
+    for covariance in itertools.islice(itertools.cycle(covariances), count):
+        square += deviations.squares(_drawn(covariance, rng))
+        expected += deviations.expected(covariance)
+    found = count * square / np.maximum(expected, LEAST_MEAN)
+    return np.asarray((MATCHED_PRIOR + found) / (MATCHED_PRIOR + count))
 
 
 def drawn_robots(offsets: RobotOffsets, count: int, rng: np.random.Generator) -> Array:
@@ -147,9 +177,17 @@ class Deviations:
         """The greatest deviation of scores (1, P), in units of its root mean square."""
         return math.sqrt(float((self.squares(scores) / self.mean).max()))
 
-    def least(self, scores: Array) -> Array:
-        """Logarithm (R,) of the least tail probability of scores (R, P); beyond the grid as a power."""
-        at, grid = np.log(np.maximum(self.squares(scores) / self.mean, 1e-12)), np.log(GRID)
+    def expected(self, covariance: Array) -> Array:
+        """Mean (D,) of the squares of scores of a covariance (P, P)."""
+        return np.add.reduceat((self.maps * (covariance @ self.maps)).sum(axis=0), self.first)
+
+    def least(self, scores: Array, found: Array | float = 1.0) -> Array:
+        """Logarithm (R,) of the least tail probability of scores (R, P); beyond the grid as a power.
+
+        Args:
+            found: factors (R, D) by which the mean squares are taken too large.
+        """
+        at, grid = np.log(np.maximum(self.squares(scores) / (self.mean * found), 1e-12)), np.log(GRID)
         out = np.zeros(len(scores))
         for x, tail in zip(at.T, self.log_tails, strict=True):
             slope = min((tail[-1] - tail[-2]) / (grid[-1] - grid[-2]), 0.0)

@@ -54,6 +54,7 @@ class RobotOffsets:
         misfit: number of the last columns that are of the misfit of laws.
         changed: (P,) variance by which columns on the judged drives differ from those on the references'; it
             is part of the covariance.
+        matched: whether the scatter is matched to the squares of the references' scores.
     """
 
     mean: Array
@@ -63,6 +64,7 @@ class RobotOffsets:
     references: int
     misfit: int = 0
     changed: Array | float = 0.0
+    matched: bool = False
 
     def known(self) -> Array:
         """(P, P) covariance on the references' drives."""
@@ -130,7 +132,9 @@ def _matched(references: Sequence[Score], offsets: RobotOffsets) -> RobotOffsets
         scale = np.divide(ratio @ shares, whole, out=np.ones(len(whole)), where=whole > LEAST_VARIANCE)
         scatter = np.maximum(scale * found.scatter, LEAST_SCATTER**2)
         mean, covariance, _ = _posterior(references, scatter, found.prior)
-        found = dataclasses.replace(found, mean=mean, covariance=covariance, scatter=scatter)
+        found = dataclasses.replace(
+            found, mean=mean, covariance=covariance, scatter=scatter, matched=True
+        )  # fmt: skip
     return found
 
 

@@ -10,7 +10,16 @@ import pytest
 
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.detection import GRID, JITTER, UNKNOWN_SIZES, WIDE, Deviations, detect
+from terrafusion.twin.gap.infer.detection import (
+    GRID,
+    JITTER,
+    MATCHED_PRIOR,
+    UNKNOWN_SIZES,
+    WIDE,
+    Deviations,
+    _matching_errors,
+    detect,
+)
 from terrafusion.twin.gap.infer.other_drives import (
     CANDIDATE_SCATTER,
     CERTAIN,
@@ -282,6 +291,20 @@ def test_scores_of_columns_that_act_alike_vary_as_references_show(scatter: float
             found.append(_over_expected(references, offsets)[:10].mean())
     assert np.median(after) == pytest.approx(1.0, abs=0.15)
     assert abs(np.median(after) - 1.0) <= abs(np.median(before) - 1.0)
+
+
+def test_replicates_repeat_how_uncertain_a_matched_scatter_is() -> None:
+    """A mean square of n references varies by 2 / n of itself, and an unusual score is less so."""
+    references, runs = trial(3, "reference", effect=2.0)
+    offsets = learn_offsets(references, len(CANDIDATES.keys))
+    A, n = runs[0].A, len(references)
+    parts = [A @ offsets.known() @ A + A, np.zeros_like(A), (A * offsets.scatter) @ A]
+    deviations = Deviations.of(A, parts, n, CANDIDATES)
+    factors = _matching_errors(runs, deviations, offsets, np.random.default_rng(0))
+    assert factors[:, :P].mean(axis=0) == pytest.approx(1.0, abs=0.05)
+    assert factors[:, :P].var(axis=0) == pytest.approx(2.0 * n / (MATCHED_PRIOR + n) ** 2, rel=0.25)
+    sure = dataclasses.replace(offsets, matched=False)
+    assert detect(runs, offsets, CANDIDATES, 0).p_value > 1.5 * detect(runs, sure, CANDIDATES, 0).p_value
 
 
 def _over_expected(references: list[Score], offsets: RobotOffsets) -> np.ndarray:
