@@ -164,7 +164,7 @@ TWIN = (
             "--share",
             "0.25",
             "--seed",
-            "3127",
+            "4211",
             "--minutes",
             "40",
             "--no-opponent",
