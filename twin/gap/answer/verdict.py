@@ -75,10 +75,12 @@ class GapVerdict:
         """The most probable of the named causes that cannot be distinguished from others."""
         return next((c for c in self.causes if c.effect in self.named and len(c.members) > 1), None)
 
-    def withheld_on_unseen_drives(self, significant: bool = True) -> Self:
+    def withheld_on_unseen_drives(self, significant: bool = True, sure: bool = False) -> Self:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
-        well, as it may come from these, or where the test is not `significant` at a stricter threshold."""
-        if significant and self.kind != "unknown" and self.log_odds >= 0.0 and self.left <= MOST_LEFT:
+        well, as it may come from these, or where the test is not `significant` at a stricter threshold. An
+        unknown cause stands where it is `sure` that there is one."""
+        explained = self.kind != "unknown" and self.log_odds >= 0.0 and self.left <= MOST_LEFT
+        if (significant and explained) or (sure and self.kind == "unknown"):
             return self
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
         return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)

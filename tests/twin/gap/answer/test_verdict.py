@@ -97,6 +97,14 @@ def test_on_unseen_drives_an_effect_that_explains_less_than_half_of_the_gap_is_n
         assert withheld.sets[0].named == (kind == "effect")
 
 
+def test_on_unseen_drives_an_unknown_cause_stands_where_the_gap_is_sure() -> None:
+    unknown = verdict({("mass",): 2.0}, detection=Detection(9.0, 1e-12))
+    effect = verdict({("mass",): 600.0}, left={("mass",): 0.7})
+    assert unknown.withheld_on_unseen_drives().kind == "no_gap"
+    assert unknown.withheld_on_unseen_drives(sure=True).kind == "unknown"
+    assert effect.withheld_on_unseen_drives(sure=True).kind == "no_gap"
+
+
 def test_an_extrapolated_p_value_is_little_evidence_of_an_unknown_cause_on_other_drives() -> None:
     kinds = [
         verdict({("mass",): 3.0}, detection=Detection(9.0, p), other_drives=other).kind
