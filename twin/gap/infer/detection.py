@@ -20,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import Candidates
@@ -93,14 +94,14 @@ def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.
     """Pooled scores (R, P) less their mean."""
     robot = drawn_robots(offsets, REPLICATES, rng)
     scatter = drawn_scatter(offsets, len(runs), REPLICATES, rng)
-    return robot @ A + _drawn(A, rng) + sum(own @ r.A for own, r in zip(scatter, runs, strict=True))
+    noise = rng.standard_normal((REPLICATES, len(A))) @ _root(A).T
+    return robot @ A + noise + sum(own @ r.A for own, r in zip(scatter, runs, strict=True))
 
 
-def _drawn(covariance: Array, rng: np.random.Generator) -> Array:
-    """Normal scores (R, P) of a covariance (P, P)."""
+def _root(covariance: Array) -> Array:
+    """A matrix (P, P) whose product with its transpose is the covariance."""
     values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(rng.standard_normal((REPLICATES, len(covariance))) @ root.T)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _matching_errors(
@@ -113,9 +114,11 @@ def _matching_errors(
     own, count = len(deviations.maps), offsets.references
     square, expected = np.zeros((REPLICATES, len(deviations.mean))), np.zeros(len(deviations.mean))
     covariances = [((r.A * offsets.scatter) @ r.A + r.A)[:own, :own] for r in runs]
-    for covariance in itertools.islice(itertools.cycle(covariances), count):
-        square += deviations.squares(_drawn(covariance, rng))
-        expected += deviations.expected(covariance)
+    mapped = [(_root(c).T @ deviations.maps).astype(np.float32) for c in covariances]
+    for some in itertools.islice(itertools.cycle(mapped), count):
+        drawn = rng.standard_normal((REPLICATES, own), dtype=np.float32) @ some
+        square += deviations.summed(np.square(drawn))
+        expected += deviations.summed(np.square(some).sum(axis=0))
     found = count * square / np.maximum(expected, LEAST_MEAN)
     return np.asarray((MATCHED_PRIOR + found) / (MATCHED_PRIOR + count))
 
@@ -171,15 +174,15 @@ class Deviations:
 
     def squares(self, scores: Array) -> Array:
         """Squares (R, D) of the deviations of scores (R, P)."""
-        return np.add.reduceat(np.square(scores @ self.maps), self.first, axis=1)
+        return self.summed(np.square(scores @ self.maps))
+
+    def summed(self, squares: NDArray[np.floating]) -> Array:
+        """Squares (..., D) of deviations by those of their components (..., Q)."""
+        return np.add.reduceat(squares, self.first, axis=-1, dtype=np.float64)
 
     def greatest(self, scores: Array) -> float:
         """The greatest deviation of scores (1, P), in units of its root mean square."""
         return math.sqrt(float((self.squares(scores) / self.mean).max()))
-
-    def expected(self, covariance: Array) -> Array:
-        """Mean (D,) of the squares of scores of a covariance (P, P)."""
-        return np.add.reduceat((self.maps * (covariance @ self.maps)).sum(axis=0), self.first)
 
     def least(self, scores: Array, found: Array | float = 1.0) -> Array:
         """Logarithm (R,) of the least tail probability of scores (R, P); beyond the grid as a power.
