@@ -42,8 +42,8 @@ FEWEST_AGREEING, AGREEING = 3, 0.5
 """Runs from which each is left out, and the factor on the p-value of the others, as fewer show less (set on
 two robots of the study `unseen_gap`, tried on two others)."""
 MATCHED_PRIOR = 2.0
-"""Weight, in references, of the mean square that a matching expects of a deviation (set on robots 107 and 124
-of the study `unseen_gap`)."""
+"""Weight, in references, of the mean square that a matching expects of a deviation (of 2, 6 and 12 that with
+the fewest alarms on clean runs of robots 133 and 134 of the study `unseen_gap` and of another simulator)."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost
 GRID = np.geomspace(0.05, 3000.0, 80)  # squares over their mean, between which tails are interpolated
 
