@@ -41,7 +41,7 @@ REPLICATES, LOWEST = 1000, 20
 FEWEST_AGREEING, AGREEING = 3, 0.5
 """Runs from which each is left out, and the factor on the p-value of the others, as fewer show less (set on
 two robots of the study `unseen_gap`, tried on two others)."""
-MATCHED_PRIOR = 2.0
+EXPECTED_WEIGHT = 2.0
 """Weight, in references, of the mean square that a matching expects of a deviation (of 2, 6 and 12 that with
 the fewest alarms on clean runs of robots 133 and 134 of the study `unseen_gap` and of another simulator)."""
 NODES, LEAST_CHANCE = 24, 1e-10  # of the distribution of a factor, and the chance beyond the outermost
@@ -120,7 +120,7 @@ def _matching_errors(
         square += deviations.summed(np.square(drawn))
         expected += deviations.summed(np.square(some).sum(axis=0))
     found = count * square / np.maximum(expected, LEAST_MEAN)
-    return np.asarray((MATCHED_PRIOR + found) / (MATCHED_PRIOR + count))
+    return np.asarray((EXPECTED_WEIGHT + found) / (EXPECTED_WEIGHT + count))
 
 
 def drawn_robots(offsets: RobotOffsets, count: int, rng: np.random.Generator) -> Array:

@@ -11,9 +11,9 @@ import pytest
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.detection import (
+    EXPECTED_WEIGHT,
     GRID,
     JITTER,
-    MATCHED_PRIOR,
     UNKNOWN_SIZES,
     WIDE,
     Deviations,
@@ -302,7 +302,7 @@ def test_replicates_repeat_how_uncertain_a_matched_scatter_is() -> None:
     deviations = Deviations.of(A, parts, n, CANDIDATES)
     factors = _matching_errors(runs, deviations, offsets, np.random.default_rng(0))
     assert factors[:, :P].mean(axis=0) == pytest.approx(1.0, abs=0.05)
-    assert factors[:, :P].var(axis=0) == pytest.approx(2.0 * n / (MATCHED_PRIOR + n) ** 2, rel=0.25)
+    assert factors[:, :P].var(axis=0) == pytest.approx(2.0 * n / (EXPECTED_WEIGHT + n) ** 2, rel=0.25)
     sure = dataclasses.replace(offsets, matched=False)
     assert detect(runs, offsets, CANDIDATES, 0).p_value > 1.5 * detect(runs, sure, CANDIDATES, 0).p_value
 
