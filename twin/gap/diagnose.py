@@ -14,7 +14,7 @@ from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import Planner
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
-from terrafusion.twin.gap.answer.verdict import FINEST_P, judge
+from terrafusion.twin.gap.answer.verdict import FINEST_P, GapVerdict, judge
 from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import check_distinct
@@ -24,7 +24,7 @@ from terrafusion.twin.gap.infer.explain import explain
 from terrafusion.twin.gap.infer.law_misfit import with_law_misfit
 from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets
 from terrafusion.twin.gap.infer.run_states import learn_state_sigma
-from terrafusion.twin.gap.null.drives import drive_coverage
+from terrafusion.twin.gap.null.drives import DriveCoverage, drive_coverage
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.gap.null.score import replicates, score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
@@ -36,8 +36,8 @@ STRICTER = 0.2
 """On drives unlike the references', or ground patchier than theirs, the p-value must be below such a share of
 the significance (assumed): how wrong laws are there is no more than assumed."""
 HALF_COVERED = 0.5
-"""Share of the judged time that references cover, from which drives alone make no p-value below the finest
-(clean robots 112 to 134 of the study `unseen_gap` on other drives: 0.0002 at least)."""
+"""Share of the judged time that references cover, from which drives alone make no p-value as low as the
+finest (assumed, with robots 112 to 134 of the study `unseen_gap` in view)."""
 TOO_FEW = (
     "{} reference runs, of at least {} that show how runs scatter: twin replicates stand in, and false "
     "alarms are as frequent as the twin is wrong (uncalibrated)"
@@ -128,11 +128,7 @@ def diagnose_evidence(
     drives = drive_coverage(runs, evidence.references, evidence.model)
     limited = drives is not None and drives.limits()
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
-    if limited or evidence.patchier is not None:
-        half = drives is not None and drives.covered >= HALF_COVERED and evidence.patchier is None
-        verdict = verdict.withheld_on_unseen_drives(
-            detection.p_value <= STRICTER * significance, half and detection.p_value <= FINEST_P[False]
-        )
+    verdict = withheld(verdict, detection.p_value, significance, drives, evidence.patchier is not None)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit, explanation.left_out)
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
@@ -140,3 +136,15 @@ def diagnose_evidence(
         vehicle, detection, significance, uncalibrated, where, verdict, shrunk, following,
         drives, evidence, tuple(notes),
     )  # fmt: skip
+
+
+def withheld(
+    verdict: GapVerdict, p_value: float, significance: float, drives: DriveCoverage | None, patchier: bool
+) -> GapVerdict:
+    """The verdict, undecided where drives unlike the references', or patchier ground, may cause the gap."""
+    if not patchier and (drives is None or not drives.limits()):
+        return verdict
+    half = not patchier and drives is not None and drives.covered >= HALF_COVERED
+    return verdict.withheld_on_unseen_drives(
+        p_value <= STRICTER * significance, sure=half and p_value <= FINEST_P[False]
+    )

@@ -7,10 +7,12 @@ import pytest
 
 from terrafusion.twin.gap.answer.verdict import GapVerdict, judge
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.diagnose import withheld
 from terrafusion.twin.gap.infer.calibration import Head
 from terrafusion.twin.gap.infer.detection import Detection
 from terrafusion.twin.gap.infer.explain import Explanation
 from terrafusion.twin.gap.infer.single_effects import Fitted
+from terrafusion.twin.gap.null.drives import DriveCoverage
 
 NAMES = ("soil_strength", "mass", "gyro_bias", "gyro_scale", "track_width")
 CANDIDATES = Candidates.of(NAMES)
@@ -92,9 +94,9 @@ def test_on_unseen_drives_an_effect_that_explains_less_than_half_of_the_gap_is_n
     for left, kind in ((0.3, "effect"), (0.7, "no_gap")):
         found = verdict({("mass",): 600.0}, left={("mass",): left})
         assert found.named == ("mass",)
-        withheld = found.withheld_on_unseen_drives()
-        assert withheld.kind == kind
-        assert withheld.sets[0].named == (kind == "effect")
+        after = found.withheld_on_unseen_drives()
+        assert after.kind == kind
+        assert after.sets[0].named == (kind == "effect")
 
 
 def test_on_unseen_drives_an_unknown_cause_stands_where_the_gap_is_sure() -> None:
@@ -103,6 +105,20 @@ def test_on_unseen_drives_an_unknown_cause_stands_where_the_gap_is_sure() -> Non
     assert unknown.withheld_on_unseen_drives().kind == "no_gap"
     assert unknown.withheld_on_unseen_drives(sure=True).kind == "unknown"
     assert effect.withheld_on_unseen_drives(sure=True).kind == "no_gap"
+
+
+@pytest.mark.parametrize(
+    ("covered", "p_value", "patchier", "kind"),
+    [
+        (0.9, 1e-3, False, "unknown"), (0.6, 1e-5, False, "unknown"), (0.6, 1e-3, False, "no_gap"),
+        (0.4, 1e-5, False, "no_gap"), (0.6, 1e-5, True, "no_gap"), (0.9, 1e-5, True, "no_gap"),
+    ],
+)  # fmt: skip
+def test_an_unknown_cause_needs_drives_that_are_covered_and_alike_ground(
+    covered: float, p_value: float, patchier: bool, kind: str
+) -> None:
+    unknown = verdict({("mass",): 2.0}, detection=Detection(9.0, 1e-12))
+    assert withheld(unknown, p_value, 0.05, DriveCoverage(covered, ()), patchier).kind == kind
 
 
 def test_an_extrapolated_p_value_is_little_evidence_of_an_unknown_cause_on_other_drives() -> None:
