@@ -14,7 +14,7 @@ from terrafusion.twin.effects.catalogue import forms_of, lookup
 from terrafusion.twin.effects.form import NOMINAL_KG, NOMINAL_RADIUS_M
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
-from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet
+from terrafusion.twin.gap.answer.verdict import MOST_LEFT, Cause, CredibleSet
 from terrafusion.twin.gap.answer.where import LEAST_REFERENCES, GapCell
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 
@@ -235,7 +235,11 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
     if s.floor is None:
         how = "by an unknown share: there are no references to compare with"
     elif s.share is None:
-        how = "by an unknown share: the gap is hardly above what references have themselves; doubt the cause"
+        how = "by an unknown share: the error, sample by sample, is hardly above the references' own"
+        if d.verdict.left > MOST_LEFT:
+            how += "; doubt the cause"
+        else:
+            how += f". Of the gap over whole runs the cause explains {percent(1.0 - d.verdict.left)}"
     else:
         interval = (
             "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"

@@ -49,12 +49,19 @@ def test_sizes_that_grow_with_the_robot_say_for_which_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "interval", "doubted"),
-    [(0.7, (0.4, 0.9), False), (0.0, (0.0, 0.3), True), (0.6, (0.0, 1.0), True), (None, None, True)],
+    ("share", "interval", "left", "doubted"),
+    [
+        (0.7, (0.4, 0.9), 0.1, False),
+        (0.0, (0.0, 0.3), 0.1, True),
+        (0.6, (0.0, 1.0), 0.1, True),
+        (None, None, 0.9, True),
+        (None, None, 0.1, False),
+    ],
 )
 def test_a_cause_that_removes_no_error_for_sure_is_doubted(
-    share: float | None, interval: tuple[float, float] | None, doubted: bool
+    share: float | None, interval: tuple[float, float] | None, left: float, doubted: bool
 ) -> None:
     shrink = SimpleNamespace(floor=1.0, share=share, interval=interval, physical={}, channels={})
-    answer: Any = SimpleNamespace(shrinkage=shrink, verdict=SimpleNamespace(named=("mass",)), runs=("a", "b"))
+    verdict = SimpleNamespace(named=("mass",), left=left)
+    answer: Any = SimpleNamespace(shrinkage=shrink, verdict=verdict, runs=("a", "b"))
     assert ("doubt the cause" in _shrinks(answer, 3)[0]) == doubted
