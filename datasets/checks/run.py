@@ -1,5 +1,6 @@
 """Run all checks on a recording, and apply the repairs they offer."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -124,6 +125,8 @@ def repair(recording: Recording, rig: Rig | None = None) -> tuple[Recording, lis
             break
         note = f"repaired: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
         recording = first.repair(recording).with_notes(note)
+        if first.code in ("imu-axes", "imu-forward"):  # else the vehicle would turn it again
+            recording = dataclasses.replace(recording, unturned=())
         repaired.append(first)
     return recording, repaired
 

@@ -197,7 +197,8 @@ def _progress(context: CheckContext, rolled: motion.Integral | None) -> tuple[fl
         steps = np.abs(np.diff(np.interp(grid, path.t_s, path.place)))
         distance = float(np.sum(rolled.rates(grid)) * 10.0)
         if distance > 10.0 * max(path.sigma_m, 0.1):
-            return float(steps.sum()) / distance, path.source
+            moved = np.sqrt(max(float((steps**2).mean()) - 4.0 * path.sigma_m**2, 0.0))  # less the noise
+            return moved * len(steps) / distance, path.source
     return None
 
 

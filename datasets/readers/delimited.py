@@ -229,6 +229,9 @@ def read_columns(
         raise limits.too_much("values", limits.VALUES)
     _check_counts(data, layout)
     table = _parse(data, layout, numbers, texts)
+    if table is None and not layout.strict and layout.separator != BLANKS:  # pandas knows no "nan "
+        mark = re.escape(layout.separator.encode())
+        table = _parse(re.sub(rb" +(?=" + mark + rb"|[\r\n]|$)", b"", data), layout, numbers, texts)
     if table is None or _is_suspect(table, data, layout, numbers):
         _check_cells(data, layout, set(numbers))
     if table is None:

@@ -102,6 +102,7 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         **stated,
         terrain_name=meta.terrain or "",
         truth_channels=contents,
+        unturned=tuple(n for n in meta.unturned if channels[n] is not None),
         overrides=meta.overrides(),
         notes=(*meta.notes, *(note for note in notes if note not in meta.notes)),
         clock_jumps=meta.clock_jumps,

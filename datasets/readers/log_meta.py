@@ -67,6 +67,7 @@ class MetaFile(DescriptionFile):
         int,
         Whole("", 0, MAX_START_NS, meaning="the Unix time of t_s = 0 in whole nanoseconds (0 when unknown)"),
     ]
+    unturned: tuple[Annotated[str, Word(("imu", "magnetometer"))], ...] = ()
     notes: tuple[str, ...] = ()
     clock_jumps: Annotated[tuple[ClockJump, ...], Prepared(_listed, {"type": "object"})] = ()
     keep_empty: Switch = False

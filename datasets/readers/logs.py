@@ -28,6 +28,8 @@ def opened(logs: Log | Sequence[Log], rig: Rig | None = None) -> list[Recording]
         if not isinstance(log, (Recording, str, Path)):
             remedy = "give a Recording, or the path or name of a log"
             raise DataError(f"a {type(log).__name__} is no log", remedy=remedy)
-        recording = log if isinstance(log, Recording) else open_recording(log, rig=rig)
-        found.append(recording if rig is None else turned_as_mounted(recording, rig))
+        if isinstance(log, Recording):
+            found.append(log if rig is None else turned_as_mounted(log, rig))
+        else:
+            found.append(open_recording(log, rig=rig))
     return found

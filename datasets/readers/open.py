@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog, locate, sha256_of
-from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, apply
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, apply, turned_as_mounted
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
@@ -67,9 +67,10 @@ def open_recordings(
         what = f"holds {len(recordings)} recordings, numbered from 0"
         raise DataError(what, file=place, remedy="give a smaller number")
     chosen = recordings if number is None else [recordings[number]]
-    return [
+    found = [
         apply(_credited(r, entry).with_notes(*notes, *_unused(form, request)), conventions) for r in chosen
     ]
+    return found if rig is None else [turned_as_mounted(r, rig) for r in found]
 
 
 def open_recording(path: Path | str, **options: Any) -> Recording:

@@ -141,6 +141,7 @@ def meta_of(recording: Recording, file: Path, name: str) -> dict[str, Any]:
         "truth_frame": r.truth_frame if r.truth_frame != "base" else None,
         "terrain_source": source if source != "annotation" else None,
         "imu_frame_id": r.imu_frame_id or None,
+        "unturned": list(r.unturned) or None,
         "notes": list(r.notes) or None,
         "clock_jumps": [
             {"channel": jump.channel, "t_ns": int(jump.t_ns), "step_s": float(jump.step_s)}

@@ -33,15 +33,6 @@ LIVE = Path("live")
 """Stands in errors where a bag has its path."""
 KINDS = ("imu", "wheels", "gnss", "gnss_velocity", "command", "barometer", "steering", "datum")
 """Channels that an estimator takes live."""
-DEFINITIONS = {
-    topics.ACKERMANN: "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
-    "float32 acceleration\nfloat32 jerk\n"
-}
-DEFINITIONS[topics.ACKERMANN_STAMPED] = (
-    "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
-    f"{'=' * 80}\nMSG: ackermann_msgs/AckermannDrive\n{DEFINITIONS[topics.ACKERMANN]}"
-)
-"""Types that are not part of ROS 2 itself."""
 VELOCITY_APART_NS = 50_000_000
 """A velocity belongs to a fix of the same time, within this."""
 MOST_GATHERED = 50_000
@@ -49,7 +40,7 @@ MOST_GATHERED = 50_000
 
 def live_types(msgtype: str) -> Mapping[str, Fields]:
     """Fields of a type and of those it is made of, as ROS 2 Humble has them."""
-    return types_of(BagSource(0, "", msgtype, DEFINITIONS.get(msgtype, ""), "msg", "cdr", 0))
+    return types_of(BagSource(0, "", msgtype, "", "msg", "cdr", 0))
 
 
 @dataclass(frozen=True)
@@ -89,7 +80,7 @@ class GatheredMessages:
         """The topics that have messages."""
         counts = Counter((message.topic, message.msgtype) for message in self.messages)
         return [
-            BagSource(i, topic, msgtype, DEFINITIONS.get(msgtype, ""), "msg", "cdr", count)
+            BagSource(i, topic, msgtype, "", "msg", "cdr", count)
             for i, ((topic, msgtype), count) in enumerate(counts.items())
         ]
 

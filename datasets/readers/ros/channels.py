@@ -296,6 +296,7 @@ class ChannelBuilder:
             [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)], axis=1
         )
         variance[stream.column("position_covariance_type") == 0] = np.nan
+        variance[variance >= UNKNOWN_VARIANCE] = np.nan
         with np.errstate(invalid="ignore"):
             return np.asarray(np.sqrt(variance))
 

@@ -21,18 +21,19 @@ _SHORT = {
 _SHORT |= {f"l{e}": (end, "left") for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))}
 _SHORT |= {"rf": ("front", "right"), "rb": ("rear", "right")}
 _STEERING = re.compile(r"steer", re.IGNORECASE)
-_NOT_WHEELS = re.compile(r"steer|arm|flipper|gripper|pan|tilt|caster|suspension|rocker|bogie", re.IGNORECASE)
+_NOT_WHEELS = re.compile(
+    r"steer|(?<![a-z])(arm|pan|tilt)s?(?![a-z])|flipper|gripper|caster|suspension|rocker|bogie", re.IGNORECASE
+)
 
 
 def wheel_of_joint(joint: str) -> str | None:
     """Name of the wheel (left, front_right, ...) by the name of its joint, or None."""
-    return None if _NOT_WHEELS.search(joint) else _place_of_joint(joint)
+    return None if _NOT_WHEELS.search(_spaced(joint)) else _place_of_joint(joint)
 
 
 def _place_of_joint(joint: str) -> str | None:
     """Where a joint is, by its name: left, front_right, ..., or None."""
-    spaced = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint)
-    words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
+    words = [word for word in re.split(r"[^a-z]+", _spaced(joint).lower()) if word]
     for word in words:
         if word in _SHORT:
             return "_".join(_SHORT[word])
@@ -43,6 +44,10 @@ def _place_of_joint(joint: str) -> str | None:
     if end is None and any(w in ("middle", "mid", "center", "centre") for w in words):
         return None
     return f"{end}_{side}" if end else side
+
+
+def _spaced(joint: str) -> str:
+    return re.sub(r"([a-z])([A-Z])", r"\1_\2", joint)
 
 
 def wheel_joints(names: Sequence[str], named: dict[str, str]) -> dict[str, str]:
@@ -56,6 +61,9 @@ def wheel_joints(names: Sequence[str], named: dict[str, str]) -> dict[str, str]:
     for layout in (Wheels.LAYOUTS[1], Wheels.LAYOUTS[0]):
         if all(wheel in found for wheel in layout):
             return {wheel: found[wheel] for wheel in layout}
+    for end in ("rear", "front"):  # one driven axle
+        if f"{end}_left" in found and f"{end}_right" in found:
+            return {side: found[f"{end}_{side}"] for side in ("left", "right")}
     return {}
 
 
@@ -106,6 +114,8 @@ def joint_values(stream: Stream, joints: Sequence[str], path: str) -> Array | No
     out = np.full((len(stream), len(joints)), np.nan)
     for rows, names, columns in _by_names(stream):
         values = columns.get(path)
+        if values is not None and values.ndim == 2 and not values.shape[1]:
+            continue  # drivers leave them out until the hardware answers
         if values is None or values.ndim != 2 or values.shape[1] != len(names):
             return None
         out[rows] = values[:, [names.index(joint) for joint in joints]]

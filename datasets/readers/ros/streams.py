@@ -1,5 +1,6 @@
 """Topics of a bag as streams, the same for ROS 1 and ROS 2: messages as arrays, decoded in one pass."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -33,6 +34,15 @@ POSE_AT = {
 }
 ACKERMANN_AT = {topics.ACKERMANN: "", topics.ACKERMANN_STAMPED: "drive."}
 """What stands before the fields of an AckermannDrive."""
+DEFINITIONS = {
+    topics.ACKERMANN: "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+    "float32 acceleration\nfloat32 jerk\n"
+}
+DEFINITIONS[topics.ACKERMANN_STAMPED] = (
+    "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+    f"{'=' * 80}\nMSG: ackermann_msgs/AckermannDrive\n{DEFINITIONS[topics.ACKERMANN]}"
+)
+"""Types that are not part of ROS 2 itself."""
 DIAGONAL = range(0, 36, 7)
 _RATE, _FORCE, _SIGMA = "angular_velocity", "linear_acceleration", "position_covariance"
 FIELDS = {
@@ -268,7 +278,9 @@ def types_of(source: BagSource) -> Mapping[str, Fields]:
     What the bag does not define is taken from ROS 1 Noetic or ROS 2 Humble: SQLite bags before
     ROS 2 Iron carry no definitions.
     """
-    return _released(source.encoding) | (_parsed(source) if source.definition else {})
+    definition = source.definition or DEFINITIONS.get(source.msgtype, "")
+    own = _parsed(dataclasses.replace(source, definition=definition)) if definition else {}
+    return _released(source.encoding) | own
 
 
 @cache

@@ -58,8 +58,9 @@ JOINT_PREFIX = "joint."
 
 _TRUTH = re.compile(r"(^|[/_])(ground_?truth|truth|gt)([/_]|$)", re.IGNORECASE)
 _FUSED = re.compile(
-    r"filter|fused|slam|visual|camera|lidar|laser|estimate"
-    r"|(^|[/_])(ekf|ukf|amcl|map|vio|icp|gps|gnss|imu)([/_]|$)",
+    r"filter|fused|combined|slam|visual|camera|lidar|laser|estimat|locali[sz]|mapp(ing|ed)|rtabmap|vins|loam"
+    r"|odometry/(local|global)|(local|global)_position|kinematic_state"
+    r"|(^|[/_])(ekf|ukf|amcl|map|vio|icp|lio|dlio|zed|t265|cartographer|gps|gnss|imu)([/_]|$)",
     re.IGNORECASE,
 )
 _COMMAND = re.compile(r"cmd|command", re.IGNORECASE)
@@ -208,7 +209,7 @@ def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool
     if kind == "gnss":
         return not _DATUM.search(name)
     if topic.msgtype == JOINTS:
-        return has_joints(name)
+        return not _COMMAND.search(name) and has_joints(name)
     if topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED):  # mostly a command, which is no measurement
         return not _COMMAND.search(name)
     if topic.msgtype == TWIST:  # mostly a command, and without a time: only on request
@@ -237,7 +238,7 @@ def wheel_advice(
         shown = [f"{topic.name} ({topic.msgtype})" for topic in strange[:MOST_SHOWN]]
         more = [f"{len(strange) - MOST_SHOWN} more"] if len(strange) > MOST_SHOWN else []
         parts.append(f"not used are {', '.join([*shown, *more])}, of types that are not read")
-    if not usable:
+    if not parts or not usable:
         parts.append(f"record the speeds as {JOINTS} or {ODOMETRY}, or give them as a table")
     return f"wheels: no topic was chosen for them, and replay needs them: {'; '.join(parts)}"
 
@@ -245,7 +246,7 @@ def wheel_advice(
 def _named(usable: Sequence[BagTopic], joints_of: Callable[[str], Sequence[str]]) -> Iterator[str]:
     """How each topic of a fit type is asked for."""
     for topic in usable:
-        if topic.msgtype == JOINTS:
+        if topic.msgtype == JOINTS and not _COMMAND.search(topic.name):
             joints = joints_of(topic.name)
             names = ", ".join(joints[:MOST_SHOWN]) or "none"
             yield (

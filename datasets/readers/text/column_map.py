@@ -15,7 +15,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.datasets.readers.channel_tables import COLUMNS
+from terrafusion.datasets.readers.channel_tables import COLUMNS, TRUTH_TWIST
 from terrafusion.datasets.readers.log_meta import DescriptionFile, Meta, parse_meta
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE
 
@@ -40,7 +40,7 @@ UNITS: dict[str, dict[str, float]] = {
 def units_of(field: str) -> dict[str, float]:
     """The units that a column for `field` may be in, with their factors."""
     ending = field.rpartition("_")[2]
-    numeric = field.startswith(("p_", "cov_", "q")) or "_" not in field
+    numeric = (field not in TRUTH_TWIST and field.startswith(("p_", "cov_"))) or "_" not in field
     return UNITS[""] if numeric or ending not in UNITS else UNITS[ending]
 
 

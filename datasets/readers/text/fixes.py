@@ -18,7 +18,8 @@ from terrafusion.datasets.readers.formats import Request
 Datum = tuple[float, float, float]
 
 FIX_OF_CODE: dict[str, dict[int, Fix]] = {
-    "nmea": dict(enumerate((Fix.NONE, Fix.SINGLE, Fix.DGPS, Fix.SINGLE, Fix.FIXED, Fix.FLOAT, Fix.NONE))),
+    "nmea": dict(enumerate((Fix.NONE, Fix.SINGLE, Fix.DGPS, Fix.SINGLE, Fix.FIXED, Fix.FLOAT, Fix.NONE)))
+    | {9: Fix.DGPS},
     "rtklib": dict(enumerate((Fix.NONE, Fix.FIXED, Fix.FLOAT, Fix.DGPS, Fix.DGPS, Fix.SINGLE, Fix.FLOAT))),
     "navsatfix": {-1: Fix.NONE, 0: Fix.SINGLE, 1: Fix.DGPS, 2: Fix.FIXED},
 }

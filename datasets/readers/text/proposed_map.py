@@ -100,8 +100,11 @@ _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
     ("motor", ("left_a", "right_a")),
+    ("motor", ("left_v", "right_v")),
     ("truth", ("x_m", "y_m")),
 )
+_NEEDED = {"gnss": ("latitude_deg", "east_m"), "truth": ("x_m",), "motor": ("left_a",)}
+"""One of these must be there."""
 _WHEELS = tuple(
     tuple(f"{side}_{unit}" for side in sides)
     for unit in ("radps", "mps", "rad")
@@ -228,12 +231,15 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
         if len(set(pair) & set(fields)) == 1:
             fields.pop(pair[0], None)
             fields.pop(pair[1], None)
-    for channel, needed in (("gnss", ("latitude_deg", "east_m")), ("truth", ("x_m",))):
+    for channel, needed in _NEEDED.items():
         if not set(needed) & set(found.get(channel, {})):
             found.pop(channel, None)
     gnss, wheels, steering = (found.get(channel, {}) for channel in ("gnss", "wheels", "steering"))
-    if "angle_rad" in steering:
-        found["steering"] = {"angle_rad": steering["angle_rad"]}
+    one_axle = {"front_rad", "rear_rad"} & set(steering) == {"front_rad"}
+    if "angle_rad" in steering or one_axle:
+        found["steering"] = {"angle_rad": steering["angle_rad" if "angle_rad" in steering else "front_rad"]}
+    elif "front_rad" not in steering:
+        steering.pop("rear_rad", None)
     if "latitude_deg" in gnss:
         found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())

@@ -17,6 +17,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.delimited import head_lines, number_in, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
@@ -33,7 +34,7 @@ from terrafusion.datasets.readers.text.column_map import (
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, left_out, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
-from terrafusion.datasets.readers.timed_tables import TimedTable, row_times
+from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 
@@ -50,13 +51,13 @@ def claims(path: Path, head: bytes) -> bool:
         return True
     if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
         return False
+    if path.suffix.lower() in SUFFIXES:
+        return True
     try:
         head.decode("utf-8")
     except UnicodeDecodeError as error:
         if error.start < len(head) - 3:  # else the head ends inside a character
             return False
-    if path.suffix.lower() in SUFFIXES:
-        return True
     lines = [line for _, line in head_lines(head, 20) if line.strip() and not line.startswith("#")]
     lengths = {len(split(line, separator_of(lines[0]))) for line in lines[: max(len(lines) - 1, 2)]}
     return len(lines) > 1 and len(lengths) == 1 and lengths.pop() > 1
@@ -150,7 +151,7 @@ def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[s
             f"column '{name}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
             remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
         ) from None
-    zoned = bool(texts) and re.search(r"(Z|[+-]\d\d:?\d\d)$", texts[0].strip())
+    zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", texts[0].strip())
     return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
 
 
@@ -212,3 +213,9 @@ class _Reader(ChannelReader):
         gnss, self.datum, notes = gnss_channel(self.rig, fixes, self.datum)
         self.notes += notes
         return gnss
+
+    def _truth(self, table: TimedTable) -> Trajectory:
+        once = new_times(table.t_ns)
+        if not once.all():
+            self.notes.append(f"truth: {int((~once).sum())} poses with a repeated time left out")
+        return super()._truth(table.select(once))

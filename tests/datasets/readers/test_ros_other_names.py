@@ -1,0 +1,160 @@
+"""Bags in which names decide: fused odometry, commands, joints of other robots; and IMUs as mounted."""
+
+from __future__ import annotations
+
+import dataclasses
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import get_types_from_msg
+
+from terrafusion.datasets.checks import repair
+from terrafusion.datasets.core.conventions import turned_as_mounted
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.logs import opened
+from terrafusion.datasets.readers.ros.joints import wheel_joints, wheel_of_joint
+from terrafusion.datasets.readers.ros.streams import DEFINITIONS
+from terrafusion.datasets.readers.ros.topics import ACKERMANN_STAMPED, ODOMETRY, BagTopic, looks_fused
+from terrafusion.datasets.writers import write_log_folder, write_mcap
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
+from tests.datasets.ros_bags import MAKE2, ROS2, T0, Message, imu_messages, odometry_messages, write_ros2
+
+JOINTS = "sensor_msgs/msg/JointState"
+NAMES = ["left_wheel_joint", "right_wheel_joint"]
+TIMES = [T0 + i * 50_000_000 for i in range(60)]
+
+
+def driving(topic: str = "/odom") -> list[Message]:
+    """IMU and odometry of some seconds."""
+    return imu_messages(MAKE2, n=300) + odometry_messages(MAKE2, topic=topic, n=60)
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/vins_estimator/odometry", "/lio_sam/mapping/odometry", "/rtabmap/odom", "/zed/zed_node/odom",
+        "/odometry/local", "/robot_localization/odom", "/mavros/local_position/odom",
+        "/localization/kinematic_state",
+    ],
+)  # fmt: skip
+def test_fused_odometry_is_no_wheel_sensor(topic: str, tmp_path: Path) -> None:
+    made = open_recording(write_ros2(tmp_path / "bag", driving(topic)))
+    assert made.wheels is None
+    assert not any(note.endswith(": ") for note in made.notes)
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/odom", "/wheel/odom", "/husky_velocity_controller/odom", "/odom/wheel",
+        "/diff_drive_controller/odom", "/platform/odom", "/realized/odom",
+    ],
+)  # fmt: skip
+def test_odometry_of_the_wheels_is_not_taken_for_fused(topic: str) -> None:
+    assert not looks_fused("wheels", BagTopic(topic, ODOMETRY, 1))
+
+
+def test_commanded_joints_are_no_measurement(tmp_path: Path) -> None:
+    commands = [("/joint_command", JOINTS, t, MAKE2.joints(t, NAMES, [], [9.0, 9.0])) for t in TIMES]
+    wheels = open_recording(write_ros2(tmp_path / "bag", driving() + commands)).wheels
+    assert wheels is not None
+    assert wheels.unit == "mps"  # of the odometry
+
+
+def test_steering_of_a_bag_without_definitions(tmp_path: Path) -> None:
+    """SQLite bags before ROS 2 Iron have none."""
+    ROS2.register(get_types_from_msg(DEFINITIONS[ACKERMANN_STAMPED], ACKERMANN_STAMPED))
+    angle = ROS2.types["ackermann_msgs/msg/AckermannDrive"](0.1, 0.0, 1.0, 0.0, 0.0)
+    stamped = ROS2.types[ACKERMANN_STAMPED]
+    messages = [("/drive", ACKERMANN_STAMPED, t, stamped(MAKE2.header(t, ""), angle)) for t in TIMES]
+    bag = tmp_path / "bag"
+    with Writer2(bag, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        topics = {(topic, kind) for topic, kind, _, _ in driving() + messages}
+        made = {topic: writer.add_connection(topic, kind, typestore=ROS2) for topic, kind in sorted(topics)}
+        for topic, kind, t_ns, message in driving() + messages:
+            writer.write(made[topic], t_ns, ROS2.serialize_cdr(message, kind))
+    connection = sqlite3.connect(next(bag.glob("*.db3")))
+    connection.execute("DROP TABLE message_definitions")
+    connection.commit()
+    connection.close()
+    assert open_recording(bag).steering is not None
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["rear_left_wheel_joint", "rear_right_wheel_joint", "front_left_steer_joint"],
+        ["front_left_wheel_joint", "front_right_wheel_joint", "rear_caster_wheel_joint"],
+    ],
+)
+def test_one_driven_axle_is_two_sides(names: list[str]) -> None:
+    assert wheel_joints(names, {}) == {"left": names[0], "right": names[1]}
+
+
+@pytest.mark.parametrize(
+    ("joint", "wheel"),
+    [
+        ("panther/fl_wheel_joint", "front_left"), ("farmbot/left_wheel_joint", "left"),
+        ("swarm_1/left_wheel", "left"), ("company_left_wheel", "left"), ("arm_left_wheel", None),
+        ("left_arm_joint", None), ("left_arm1_joint", None), ("arms_left", None), ("pan_left", None),
+        ("leftFlipper", None), ("caster_left_wheel", None), ("front_left_steering_wheel", None),
+    ],
+)  # fmt: skip
+def test_a_joint_is_known_by_whole_words(joint: str, wheel: str | None) -> None:
+    assert wheel_of_joint(joint) == wheel
+
+
+def test_joints_without_speed_until_the_hardware_answers(tmp_path: Path) -> None:
+    speeds = [[] if t == T0 else [6.0, 6.5] for t in TIMES]
+    joints = [
+        ("/joint_states", JOINTS, t, MAKE2.joints(t, NAMES, [], speed))
+        for t, speed in zip(TIMES, speeds, strict=True)
+    ]
+    wheels = open_recording(write_ros2(tmp_path / "bag", imu_messages(MAKE2, n=300) + joints)).wheels
+    assert wheels is not None
+    assert len(wheels) == len(TIMES) - 1
+    np.testing.assert_array_equal(wheels.speed, np.tile([6.0, 6.5], (len(wheels), 1)))
+
+
+@pytest.fixture
+def mounted(tmp_path: Path) -> Recording:
+    """A Husky's bag: its IMU is mounted as the vehicle file says, and not turned yet."""
+    R = load_vehicle("husky").rig().sensors.imu.base_from_sensor()
+    gyro, accel = R.T @ [0.1, 0.2, 0.5], R.T @ [0.0, 0.0, 9.81]
+    imu = imu_messages(MAKE2, n=600, gyro=tuple(gyro), accel=tuple(accel), frame="imu_link")
+    return open_recording(write_ros2(tmp_path / "bag", imu + odometry_messages(MAKE2, n=120)))
+
+
+@pytest.mark.parametrize("name", ["folder", "log.mcap"])
+def test_a_conversion_keeps_that_the_imu_is_not_turned_yet(
+    name: str, mounted: Recording, tmp_path: Path
+) -> None:
+    (write_mcap if name.endswith("mcap") else write_log_folder)(mounted, tmp_path / name)
+    (found,) = opened(tmp_path / name, load_vehicle("husky").rig())
+    assert found.imu is not None
+    np.testing.assert_allclose(found.imu.accel_mps2, np.tile([0.0, 0.0, 9.81], (600, 1)), atol=1e-6)
+    assert turned_as_mounted(found, load_vehicle("husky").rig()).imu is found.imu
+
+
+def test_a_repaired_imu_is_not_turned_once_more(mounted: Recording) -> None:
+    repaired, _ = repair(mounted)
+    (found,) = opened(repaired, load_vehicle("husky").rig())
+    assert found.imu is not None
+    np.testing.assert_allclose(found.imu.accel_mps2[0], [0.0, 0.0, 9.81], atol=1e-6)
+
+
+def test_an_unknown_sigma_of_heights_stays_unknown(tmp_path: Path) -> None:
+    drive = simulate("straight", vehicle="husky", terrain="asphalt")
+    assert drive.gnss is not None
+    gnss = dataclasses.replace(drive.gnss, sigma_enu_m=drive.gnss.sigma_enu_m * [1.0, 1.0, np.nan])
+    write_mcap(dataclasses.replace(drive, gnss=gnss), tmp_path / "log.mcap")
+    found = open_recording(tmp_path / "log.mcap", stamps="receipt").gnss
+    assert found is not None
+    assert np.isnan(found.sigma_enu_m[:, 2]).all()
+    assert np.isfinite(found.sigma_enu_m[:, :2]).all()

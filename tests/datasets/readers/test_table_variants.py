@@ -1,0 +1,87 @@
+"""Tables and sentences as loggers write them: blanks, other encodings, repeated times, codes of one maker."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import xor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.readers import open_recording
+
+
+def table(folder: Path, text: str, channels: str = "") -> Path:
+    path = folder / "log.csv"
+    path.write_text(text, encoding="utf-8")
+    if channels:
+        columns = f"time: {{column: t, epoch: none}}\nchannels: {{{channels}}}\n"
+        path.with_name("log.csv.columns.yaml").write_text(columns, encoding="utf-8")
+    return path
+
+
+def test_missing_values_between_blanks(tmp_path: Path) -> None:
+    text = "t , gz , a\n0.0 , nan , 2\n1.0 , 1.0 , 2\n2.0 , 1.5 , nan \n"
+    imu = open_recording(table(tmp_path, text, "imu: {gyro_z_radps: gz, accel_x_mps2: a}")).imu
+    assert imu is not None
+    np.testing.assert_array_equal(imu.gyro_radps[:, 2], [np.nan, 1.0, 1.5])
+    np.testing.assert_array_equal(imu.accel_mps2[:, 0], [2.0, 2.0, np.nan])
+
+
+def test_another_encoding_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes("t,gz,heading (°)\n0,1,2\n".encode("latin-1"))
+    with pytest.raises(DataError, match="UTF-8"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("field", ["p_radps", "q_radps"])
+def test_roll_and_pitch_rates_have_units(field: str, tmp_path: Path) -> None:
+    channels = f"truth: {{x_m: x, y_m: y, u_mps: x, v_mps: y, {field}: {{column: p, unit: deg/s}}}}"
+    truth = open_recording(table(tmp_path, "t,x,y,p\n0,1,2,180\n1,2,3,180\n", channels)).truth
+    assert truth is not None
+    assert truth.twist_body is not None
+    assert np.nanmax(truth.twist_body[:, 3:]) == pytest.approx(np.pi)
+
+
+def test_poses_with_a_repeated_time_are_left_out_and_counted(tmp_path: Path) -> None:
+    found = open_recording(table(tmp_path, "t,x,y\n0,1,2\n0,1,2\n1,2,3\n", "truth: {x_m: x, y_m: y}"))
+    assert found.truth is not None
+    assert len(found.truth) == 2
+    assert any("1 poses with a repeated time" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("names", ["left_v,right_v,gyro_z", "front_rad,left_mps,right_mps"])
+def test_a_proposed_map_opens(names: str, tmp_path: Path) -> None:
+    path = table(tmp_path, f"t,{names}\n0,1,1,0\n0.1,1,1,0\n")
+    with pytest.raises(DataError) as refused:
+        open_recording(path)
+    proposed = "{" + str(refused.value).rpartition("columns.yaml: {")[2]
+    path.with_name("log.csv.columns.yaml").write_text(proposed, encoding="utf-8")
+    open_recording(path)
+
+
+def test_fixes_aided_by_satellites_of_one_maker(tmp_path: Path) -> None:
+    """GGA quality 9 (NovAtel OEM)."""
+
+    def sentence(k: int) -> str:
+        body = f"GPGGA,1200{k:02d}.00,4807.{k:04d},N,01131.0000,E,9,08,0.9,545.4,M,46.9,M,,"
+        return f"${body}*{reduce(xor, body.encode(), 0):02X}\r\n"
+
+    path = tmp_path / "log.nmea"
+    path.write_text("".join(sentence(k) for k in range(20)), encoding="utf-8")
+    gnss = open_recording(path).gnss
+    assert gnss is not None
+    assert len(gnss) == 20
+
+
+@pytest.mark.parametrize(("offset", "said"), [("+02", False), ("+0200", False), ("Z", False), ("", True)])
+def test_times_with_an_offset_are_not_said_to_have_none(offset: str, said: bool, tmp_path: Path) -> None:
+    rows = "".join(f"2024-05-01 12:00:0{k}{offset},{k}\n" for k in range(3))
+    path = table(tmp_path, f"t,gz\n{rows}")
+    columns = "time: {column: t, unit: iso8601}\nchannels: {imu: {gyro_z_radps: gz}}\n"
+    path.with_name("log.csv.columns.yaml").write_text(columns, encoding="utf-8")
+    notes = open_recording(path).notes
+    assert any("without an offset" in note for note in notes) == said
