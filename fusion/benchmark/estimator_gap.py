@@ -137,7 +137,7 @@ def twin_of(
 def scenario_of(log: PreparedLog, model: Model) -> Scenario:
     """The drive of a log as commands: the speeds of its sides, at the vehicle's radius and track."""
     every = round(STEP_S / DT_S)
-    rim = model.vehicle.wheel.radius_m * log.sides[: len(log.sides) // every * every]
+    rim = model.vehicle.odometry.wheel_radius_m * log.sides[: len(log.sides) // every * every]
     sides = rim.reshape(-1, every, 2).mean(axis=1)
     v, r = sides.mean(axis=1), (sides[:, 1] - sides[:, 0]) / model.vehicle.odometry.track_m
     drive = tuple(DriveSegment(STEP_S, float(a), float(b)) for a, b in zip(v, r, strict=True))

@@ -235,7 +235,7 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
     if s.floor is None:
         how = "by an unknown share: there are no references to compare with"
     elif s.share is None:
-        how = "by an unknown share: the error, sample by sample, is hardly above the references' own"
+        how = "by an unknown share: with ground and offsets refitted, samples differ as references do"
         if d.verdict.left > MOST_LEFT:
             how += "; doubt the cause"
         else:

@@ -176,7 +176,7 @@ def _gnss(recording: Recording, vehicle: VehicleParams, start_ns: int) -> list[O
     gnss, spec = recording.gnss, vehicle.sensors.gnss
     if gnss is None or not len(gnss):
         return []
-    t_s = _seconds(gnss.t_ns, start_ns)
+    t_s = _seconds(gnss.t_ns, start_ns) - vehicle.realism.gnss_latency_s  # as the receiver's stamps are late
     seen = np.isfinite(gnss.enu_m[:, :2]).all(axis=1) & (gnss.fix > 0)
     position_sigma = np.where(
         np.isfinite(gnss.sigma_enu_m[:, :2]), gnss.sigma_enu_m[:, :2], spec.sigma_horizontal_m

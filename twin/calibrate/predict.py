@@ -181,7 +181,7 @@ def led_in(log: PreparedLog, plant: Plant, d: Directions, inputs: Array) -> tupl
 def run_up(log: PreparedLog, plant: Plant, inputs: Array) -> tuple[Array, Array]:
     """State (X,) `LEAD_S` before the log, and the inputs from there up to the first window."""
     x = np.zeros(len(STATES))
-    x[INDEX["yaw"]] = log.start[0, 2]
+    x[INDEX["yaw"]], x[INDEX["elapsed"]] = log.start[0, 2], -LEAD_S
     first = np.zeros(len(inputs[0]))  # at rest, or the first command would have acted for `LEAD_S` already
     if np.abs(log.sides[0]).max() > MOVING_RADPS:
         first[:2] = inputs[0, :2]

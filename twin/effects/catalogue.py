@@ -112,11 +112,17 @@ def by_key(values: Mapping[str, float]) -> dict[str, float]:
     """The values by key; a bare effect means its first form.
 
     Raises:
-        ConfigError: they are no mapping.
+        ConfigError: they are no mapping, or two names mean the same parameter.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"effects are {values!r}", remedy='give {"slope": 0.05}, or several so')
-    return {parameter_key(name): value for name, value in values.items()}
+    out = dict[str, float]()
+    for name, value in values.items():
+        key = parameter_key(name)
+        if key in out:
+            raise ConfigError(f"effect '{key}' is given twice, once as '{name}'", remedy="give it once")
+        out[key] = value
+    return out
 
 
 def checked(values: Mapping[str, float]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.calibrate.start import Soils
+from terrafusion.twin.effects.catalogue import by_key
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import Planner
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
@@ -82,11 +83,11 @@ def diagnose(
     """
     if not runs:
         raise DataError("no run to diagnose was given", remedy="give at least one")
-    if not 0.0 < significance < 1.0:
+    if not 0.001 <= significance <= 0.5:
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     check_source(source)
     check_distinct([*runs, *references])
-    candidates = Candidates.of(effects, vehicle.effects).sized_for(vehicle)
+    candidates = Candidates.of(effects, by_key(vehicle.effects)).sized_for(vehicle)
     evidence = gather_evidence(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, cache=cache
     )

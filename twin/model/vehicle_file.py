@@ -47,12 +47,20 @@ MEASURED = ("measured", "field log")
 
 
 def read_vehicle(name_or_path: str | Path) -> tuple[dict[str, Any], str]:
-    """Content of a vehicle file, complete, and what to call it in messages.
+    """Content of a vehicle file, complete, with effects by key, and what to call it in messages.
 
     Raises:
         ConfigError: neither a known name nor a file, or one of the short form with errors; all of them.
     """
-    return _read(name_or_path, ())
+    raw, file = _read(name_or_path, ())
+    if isinstance(raw.get("effects"), Mapping):
+        from terrafusion.twin.effects.catalogue import by_key
+
+        try:
+            return {**raw, "effects": by_key(raw["effects"])}, file
+        except ConfigError as error:
+            raise ConfigError(error.what, file=file, remedy=error.remedy) from error
+    return raw, file
 
 
 def is_short(raw: dict[str, Any]) -> bool:

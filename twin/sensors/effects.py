@@ -16,7 +16,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import moves
-from terrafusion.twin.effects.sensing import CLOCK_S
+from terrafusion.twin.effects.sensing import CLOCK_S, IMU, POSITION, VELOCITY
 from terrafusion.twin.effects.steered import drive_terms
 from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured
@@ -31,9 +31,7 @@ from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
 C = TypeVar("C", Imu, Gnss)
 
 DEAD_TIME = "dead_time/transport"
-IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
-FIXES = ("gnss_east_m", "gnss_north_m", *VELOCITY)
+FIXES = (*POSITION, *VELOCITY)
 CLOCK_DRIFT = "imu_time_offset/drift"  # the delay that grows with time: its value is that after `CLOCK_S`
 DELAYS = {
     "imu_time_offset/shift": IMU, CLOCK_DRIFT: IMU, "gnss_latency/both": FIXES,

@@ -21,9 +21,12 @@ from terrafusion.fusion.benchmark.estimator_gap import (
 from terrafusion.fusion.reports.gap import judge_rows
 from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.start import start_model
 from terrafusion.twin.gap.infer.single_effects import Fitted
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.commands import side_speeds
+from terrafusion.twin.simulate import simulate
 from tests.twin.gap.runs import run
 
 MODEL = Model(load_vehicle("elevate"), {"loose_sand": load_soil("loose_sand")})
@@ -62,6 +65,17 @@ def test_the_twin_of_a_run_turns_its_wheels_alike_and_lacks_what_the_log_lacks(
         return np.interp(t_s, at_s, log.wheels.side_speeds_mps(radius)[:, 0])
 
     assert np.abs(speeds(made) - speeds(recording)).mean() < 0.05
+
+
+def test_the_scenario_is_of_the_speeds_that_the_log_reports() -> None:
+    """A Pathfinder's odometry takes its wheels for smaller than they are."""
+    vehicle = load_vehicle("pathfinder")
+    recording = simulate("straight", vehicle=vehicle, seed=1)
+    model, ground, _ = start_model([recording], vehicle, None)
+    log = prepare(recording, model, ground=ground)
+    twist = scenario_of(log, model).commanded(np.arange(300) * 0.1)
+    told = np.abs(side_speeds(twist, model.vehicle)).max()
+    assert told == pytest.approx(np.abs(log.sides).max(), rel=0.01)
 
 
 def fake(found_fit: Fitted | None, driven: tuple[Recording, PreparedLog]) -> SimpleNamespace:

@@ -13,10 +13,12 @@ from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.twin.calibrate import solver
 from terrafusion.twin.calibrate.calibrate import calibrate
 from terrafusion.twin.calibrate.files import write_files
+from terrafusion.twin.calibrate.log import prepare
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.start import coordinates_of
+from terrafusion.twin.calibrate.predict import predict
+from terrafusion.twin.calibrate.start import coordinates_of, start_model
 from terrafusion.twin.model.soil import load_soil
-from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 
@@ -85,6 +87,31 @@ def test_friction_of_a_heavy_robot_is_sought_in_proportion_to_its_weight_and_whe
     grown = 15.0  # 280 kg on wheels of 0.3 m, over 32 kg on wheels of 0.175 m
     assert (other.high, other.scale) == pytest.approx((grown * one.high, grown * one.scale))
     assert coordinates_of(name, heavy.replaced({name: 17.0}), {})[0].value(1.0) == 17.0 + other.scale
+
+
+def predicted(
+    recording: Recording, vehicle: VehicleParams, effects: dict[str, float]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What the twin says of each channel of a log, beside what was measured."""
+    model, ground, _ = start_model([recording], vehicle, None, effects)
+    log = prepare(recording, model, ground=ground)
+    values = predict(log, model, NAMES[2:], log.start)
+    return {o.channel: (v.value, o.value) for o, v in zip(log.observed, values, strict=True)}
+
+
+def test_what_grows_with_time_grows_from_the_first_sample() -> None:
+    effects = {"gyro_bias/warm_up": 0.05}
+    made = simulate_run("figure_eight", noiseless=True, effects=effects).recording
+    told, read = predicted(made, load_vehicle("elevate"), effects)["yaw_rate_radps"]
+    assert np.abs(told - read)[:20].max() < 1e-5
+
+
+def test_fixes_that_the_vehicle_file_knows_to_be_late() -> None:
+    vehicle = load_vehicle("elevate")
+    late = dataclasses.replace(vehicle, realism=dataclasses.replace(vehicle.realism, gnss_latency_s=0.3))
+    made = simulate_run("figure_eight", vehicle=late, seed=1).recording
+    off = [np.abs(np.subtract(*predicted(made, one, {})["gnss_v_e_mps"])).mean() for one in (vehicle, late)]
+    assert off[1] < 0.85 * off[0]
 
 
 @pytest.mark.parametrize("field", ["position_m", "quaternion"])

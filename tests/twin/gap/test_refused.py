@@ -33,8 +33,9 @@ def test_nonsense_is_refused(references: list[Recording]) -> None:
     assert diagnose(references[:1], [dataclasses.replace(renamed, motor=motor)], VEHICLE).references
     with pytest.raises(ConfigError, match="unknown effect"):
         diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
-    with pytest.raises(ConfigError, match="significance"):
-        diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)
+    for significance in (np.nan, 0.0, 0.9):
+        with pytest.raises(ConfigError, match="significance"):
+            diagnose(references[:1], references[1:], VEHICLE, significance=significance)
 
 
 def test_channels_that_a_log_lacks_are_noted_as_left_out(references: list[Recording]) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.twin.calibrate.files import mark_measured, set_number, write_yaml
-from terrafusion.twin.effects.catalogue import lookup
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.effects.catalogue import by_key
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.model.vehicle_file import read_vehicle
@@ -50,21 +51,21 @@ def write_corrected(diagnosis: GapDiagnosis, vehicle: str | Path, target: Path) 
         TerrafusionError: the file cannot be written.
     """
     raw, _ = read_vehicle(vehicle)
-    out, changes, params = copy.deepcopy(raw), list[str](), diagnosis.evidence.model.vehicle
+    out, changes, model = copy.deepcopy(raw), list[str](), diagnosis.evidence.model
     for key, value in values_of(diagnosis).items():
         if key in FIELDS:
-            changes += [_change_field(out, params, path, how, value) for path, how in FIELDS[key]]
+            changes += [_change_field(out, model.vehicle, path, how, value) for path, how in FIELDS[key]]
         else:
-            changes.append(_change_effect(out, params, key, value))
+            changes.append(_change_effect(out, model, key, value))
     if not changes:
         return ["no effect was named: the vehicle's file stays as it is"]
     write_yaml(target, out)
     return [*changes, f"written to {target}"]
 
 
-def _change_effect(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
+def _change_effect(raw: dict[str, Any], model: Model, key: str, value: float) -> str:
     """Adds to an effect that is no number of the vehicle."""
-    before, number = vehicle.effects.get(key, 0.0), lookup(key)[1]
+    before, number = by_key(model.vehicle.effects).get(key, 0.0), model.parameter(key)
     after = min(max(before + value, number.low), number.high)
     source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
     raw.setdefault("effects", {})[key] = {"value": after, "source": source}

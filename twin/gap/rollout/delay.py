@@ -13,10 +13,10 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
-from terrafusion.twin.calibrate.predict import LEAD_S, averaging
-from terrafusion.twin.effects.sensing import CLOCK_S
+from terrafusion.twin.calibrate.predict import averaging
+from terrafusion.twin.effects.sensing import CLOCK_S, IMU
 from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map
-from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, IMU
+from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS
 
 
 def delayed_samples(log: PreparedLog, effects: Mapping[str, float]) -> list[tuple[Indices, Array]]:
@@ -40,5 +40,5 @@ def _delay_s(observed: Observed, delays: Mapping[str, float]) -> Array:
     out = np.zeros(len(middle))
     for key, value in delays.items():
         if observed.channel in DELAYS[key]:
-            out += value * ((middle + LEAD_S) / CLOCK_S if key == CLOCK_DRIFT else 1.0)
+            out += value * (middle / CLOCK_S if key == CLOCK_DRIFT else 1.0)
     return out

@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.effects.sensing import IMU
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
 from terrafusion.twin.gap.data.samples import sample_map
@@ -20,7 +21,7 @@ from terrafusion.twin.gap.rollout.sensitivities import (
     predictions,
 )
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, IMU, without_delays
+from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS, without_delays
 from tests.twin.gap.runs import run
 
 CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
