@@ -133,10 +133,13 @@ class SelfCalibration:
 
     def _due(self) -> bool:
         fixes = len(self._drive.fix) + len(self._fixes)
+        if fixes < FEWEST_NODES and len(self._first) > MOST_NODES:  # without fixes there is nothing to learn
+            self.restart()
+            return False
         wait_s = 0.0 if self._far else STEP_S
         if min(len(self._first), fixes) < FEWEST_NODES or self._now_s - self._stepped_s < wait_s:
             return False
-        standing = self._rolled_m == 0.0 and self._state is not None
+        standing = self._rolled_m == 0.0
         return not (standing and self._state is not None and len(self._state) == len(self._first))
 
     def _end(self, work: Reduction) -> bool:

@@ -60,6 +60,7 @@ from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, usual_interval_s
 from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
 from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
+from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.weighting import wheel_innovation_test
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
@@ -126,6 +127,7 @@ class Estimator:
         self._search = StartSearch(config, self.aids, self.gnss)
         self._set_step(config.keyframe_s)
         self._state: State | None = None
+        self._carried: tuple[Array, SensorNoise] | None = None
         self._fresh: tuple[State, MeanMotion] | None = None
         self._stationarity, self.monitor = StationarityDetector(rig), MotionMonitor(rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
@@ -241,9 +243,10 @@ class Estimator:
         """The newest state carried to the newest IMU sample, in the frame "map", or "odom" in which no fix
         makes the path jump (`OdometryFrame`); None before the start.
         """
-        if self._state is None:
+        if self._state is None or self._carried is None:
             return None
-        now = self._propagator.carry(self._state, self._reported_covariance, self.imu, self.weights.noise)
+        covariance, noise = self._carried
+        now = self._propagator.carry(self._state, covariance, self.imu, noise)
         return now if in_map(frame) else self._frame.of(self._state, now)
 
     def dump(self) -> bytes:
@@ -304,8 +307,9 @@ class Estimator:
         newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
         # Live, keyframes before the start are not reported; in a batch they are.
         self._silent = self.chain.archive is None
-        while self.chain.nodes[-1].t_ns + 2 * self._step_ns <= newest:
-            self._keyframe(self.chain.nodes[-1].t_ns + self._step_ns)
+        next_ns, step_ns = self.imu.next_ns, self._step_ns
+        while (t_ns := next_ns(self.chain.nodes[-1].t_ns, step_ns)) + step_ns <= newest:
+            self._keyframe(t_ns)
         self._silent = False
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
@@ -388,6 +392,7 @@ class Estimator:
         if fresh is None:
             return
         state, mean = fresh
+        self._propagator = Propagator(self._preintegrator)  # learning may correct samples that it has taken
         self.learned.keyframe(self.chain, mean)
         for stream in (self.imu, self.wheels, self.steering):
             stream.forget(state.t_ns - KEPT_NS)
@@ -423,6 +428,7 @@ class Estimator:
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
         aided = not (self.gnss.local or self.gnss.is_outage(t_ns))
         self._place_doubt.step(t_ns, key, float(key.rate(gyro)[2]), aided)
+        covariance = self._reported_covariance
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
@@ -430,9 +436,9 @@ class Estimator:
             status="running" if aided else ("no_gnss" if self.gnss.unplaced else "outage"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
-            **state_fields(key, self._reported_covariance, gyro, gyro_sigma),
+            **state_fields(key, covariance, gyro, gyro_sigma),
         )
-        self._state = self.gnss.widened(state)
+        self._state, self._carried = self.gnss.widened(state), (covariance, self.weights.noise)
         if not self._silent:
             call_back(self._on_state, self._state)
         return self._state

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,8 @@ UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """Heading sigma after the heading was corrected from the motion (assumed)."""
+REPEATED_WITHIN = 8
+"""Last fixes among which a new one may be a copy: of two drivers, or of a topic that is forwarded twice."""
 VELOCITY_SIGMA_MPS = 0.3
 """Velocity sigma after the fixes used turned out to be far less accurate than reported (assumed)."""
 
@@ -77,6 +80,7 @@ class GnssUpdater:
         self.turned, self._applied_scale = 0, 1.0
         self._bias_sigma = config.rig.sensors.imu.bias_sigma
         self.waiting: list[GnssFix] = []
+        self._recent = deque[tuple[int, float, float]](maxlen=REPEATED_WITHIN)
         self.local = False
         self.open_heading: OpenHeading | None = None
         self.alignment: MapAlignment | None = None
@@ -93,7 +97,12 @@ class GnssUpdater:
         self._seen, self._share = 0, 0.0
 
     def queue(self, fix: GnssFix) -> None:
-        """Take a fix in, in any order of time."""
+        """Take a fix in, in any order of time; one that came already is left out."""
+        east_m, north_m, _ = fix.enu_m.tolist()
+        same = fix.t_ns, east_m, north_m
+        if same in self._recent:
+            return
+        self._recent.append(same)
         if self.delay_s:
             fix = dataclasses.replace(fix, t_ns=fix.t_ns - round(self.delay_s * 1e9))
         fix = self.fix_noise.believable(fix)

@@ -45,11 +45,11 @@ def key_fields(key: KeyState, gyro_radps: Array) -> dict[str, Any]:
     return {
         "position_m": np.asarray(key.pose.translation()),
         "quaternion": quaternion_of(key.pose),
-        "velocity_mps": key.velocity,
+        "velocity_mps": key.velocity.copy(),
         "angular_velocity_radps": key.rate(gyro_radps),
         "gyro_bias_radps": np.asarray(key.bias.gyroscope()),
         "accel_bias_mps2": np.asarray(key.bias.accelerometer()),
-        "linear": key.linear,
+        "linear": key.linear.copy(),
     }
 
 

@@ -67,7 +67,7 @@ def _gnss(message: GnssSample, _: EstimatorConfig) -> Arguments | None:
         return None
     enu = _vector(m.enu_m, 3, "position", "gnss")
     sigma = _vector(m.sigma_enu_m, 3, "sigma", "gnss")
-    known = math.isfinite(enu[0] + enu[1] + sigma[0] + sigma[1])
+    known = math.isfinite(enu[0] + enu[1])  # a sigma that is missing is that of the class
     return (enu, sigma, m.velocity_enu_mps, m.sigma_v_mps, m.fix) if known else None
 
 

@@ -80,10 +80,11 @@ class MotionMonitor:
         return self.cause is not None
 
     def command(self, t_ns: int, v_mps: float) -> None:
-        """The commanded forward speed, m/s."""
+        """The commanded forward speed, m/s; one older than the last is left out."""
         if not math.isfinite(v_mps):
             raise DataError(f"a commanded speed of {v_mps}", channel="command", remedy="leave it out")
-        self._command = (t_ns, v_mps)
+        if self._command is None or t_ns >= self._command[0]:
+            self._command = (t_ns, v_mps)
 
     def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:
         """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""

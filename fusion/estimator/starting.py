@@ -56,6 +56,7 @@ class StartSearch:
     def find(self, imu: ImuStream, wheels: WheelStream, steering: SteeringStream, last: bool) -> Start | None:
         """The start, or None as long as there is none; `last`: no more samples will come."""
         if not imu.t_ns or not wheels.t_ns:
+            imu.forget(imu.t_ns[-1] - SILENT_NS if imu.t_ns else 0)
             return None
         begin = max(imu.t_ns[0], wheels.t_ns[0])
         level_ns = begin + WINDOW_NS

@@ -332,13 +332,14 @@ class WheelStream(SampleStream):
         if counted is None:
             return None
         left, right = counted[0] + self._offset_m[0], counted[1] + self._offset_m[1]
-        before = self._counted[i - 1] if 0 < i == len(self.t_ns) - 1 else None
-        if before is not None:
+        if i > 0:
+            before = self.left_m[i - 1], self.right_m[i - 1]
             most_m = JUMP_M + MOST_MPS * (self.t_ns[i] - self.t_ns[i - 1]) * 1e-9
             if max(abs(left - before[0]), abs(right - before[1])) > most_m:
-                self.jumps += 1
                 left, right = (m + rolled for m, rolled in zip(before, self._by_speeds(i), strict=True))
-                self._offset_m = left - counted[0], right - counted[1]
+                if i == len(self.t_ns) - 1:  # a late sample may be from before a jump that is known
+                    self.jumps += 1
+                    self._offset_m = left - counted[0], right - counted[1]
         return left, right
 
     def _watch(self, i: int) -> None:

@@ -70,15 +70,15 @@ def checked_time(t_ns: Any, channel: str) -> int:
 
 
 def as_numbers(values: ArrayLike | None, what: str, channel: str) -> Array:
-    """Values as an array of floats.
+    """Values as an array of floats of its own: a driver may fill its buffer again.
 
     Raises:
         DataError: they are no numbers.
     """
     if type(values) is np.ndarray and values.dtype is _FLOAT:
-        return values
+        return values.copy()
     try:
-        return np.asarray(values, dtype=float)
+        return np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{what} {values!r}: no numbers", channel=channel, remedy="give floats") from None
 

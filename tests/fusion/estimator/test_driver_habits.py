@@ -1,0 +1,144 @@
+"""What drivers do: refill buffers, send twice, late or without numbers, pause, and change what they get."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.messages import GnssSample
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.streams import WheelStream
+from terrafusion.twin.simulate import simulate
+
+GRAVITY = np.array([0.0, 0.0, 9.81])
+
+
+@pytest.fixture
+def husky() -> Estimator:
+    return Estimator.for_vehicle("husky")
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=5)
+
+
+def test_a_buffer_may_be_filled_again(husky: Estimator) -> None:
+    buffer = np.zeros(3)
+    for k in range(3):
+        buffer[0] = k
+        husky.add_gnss(10**9 * (k + 1), buffer, 0.02)
+    assert [float(fix.enu_m[0]) for fix in husky.gnss.waiting] == [0.0, 1.0, 2.0]
+
+
+def test_a_state_belongs_to_the_caller(husky: Estimator) -> None:
+    husky.set_start([0.0, 0.0, 0.0], 0.0)
+    for k in range(300):
+        husky.add_wheels(k * 10**7, 1.0, 1.0)
+        husky.add_imu(k * 10**7, np.zeros(3), GRAVITY)
+    state, key = husky.latest(), husky.chain.state(husky.chain.last)
+    assert state is not None
+    before = key.velocity.copy(), key.linear.copy()
+    state.velocity_mps[:] = 99.0
+    state.linear[:] = 99.0
+    np.testing.assert_array_equal(key.velocity, before[0])
+    np.testing.assert_array_equal(key.linear, before[1])
+
+
+def test_a_fix_that_comes_twice_counts_once(husky: Estimator) -> None:
+    for _ in range(2):
+        husky.add_gnss(10**9, np.zeros(3), 0.02)
+        husky.add_gnss(2 * 10**9, np.zeros(3), 0.02)
+    assert [fix.t_ns for fix in husky.gnss.waiting] == [10**9, 2 * 10**9]
+
+
+def test_a_fix_without_a_sigma_has_that_of_its_class(husky: Estimator) -> None:
+    husky.add(GnssSample(10**9, np.zeros(3), np.full(3, np.nan), 4, None, float("nan")))
+    (fix,) = husky.gnss.waiting
+    assert np.isfinite(fix.sigma_m).all()
+
+
+def test_a_late_command_does_not_replace_a_newer_one(husky: Estimator) -> None:
+    husky.add_command(10**9, 0.0)
+    husky.add_command(7 * 10**8, 0.5)
+    assert husky.monitor._commanded(10**9) == 0.0
+
+
+def counted(first: int, late: bool = False) -> WheelStream:
+    """1 m/s for 4 s; counters from sample `first` on that begin at 1 km."""
+    stream = WheelStream()
+    order = [*range(40)]
+    if late:
+        order[25], order[26] = order[26], order[25]
+    for k in order:
+        stream.add(k * 10**8, 1.0, 1.0, *([1000.0 + 0.1 * k] * 2 if k >= first else []))
+    return stream
+
+
+@pytest.mark.parametrize("first", [0, 1, 20])
+@pytest.mark.parametrize("late", [False, True])
+def test_counters_that_begin_later_are_no_jump_of_the_robot(first: int, late: bool) -> None:
+    assert counted(first, late).travelled(0, 39 * 10**8) == pytest.approx((3.9, 3.9), abs=0.01)
+
+
+def test_a_late_sample_from_before_a_reset_of_the_counters() -> None:
+    stream = WheelStream()
+    for k in [*range(20), 21, 20, *range(22, 40)]:
+        stream.add(k * 10**8, 1.0, 1.0, *([500.0 * (k <= 20) + 0.1 * k] * 2))
+    steps = np.diff([stream.travelled(0, k * 10**8) for k in range(40)], axis=0)
+    np.testing.assert_allclose(steps, 0.1, atol=1e-6)
+
+
+def test_a_pause_before_the_start_has_no_keyframes() -> None:
+    estimator, rng, made, t_ns, x_m = (
+        Estimator.for_vehicle("husky"),
+        np.random.default_rng(0),
+        [0],
+        10**18,
+        0.0,
+    )
+    keyframe = estimator._keyframe
+
+    def counting(at_ns: int) -> None:
+        made[0] += 1
+        keyframe(at_ns)
+
+    estimator._keyframe = counting  # type: ignore[method-assign]
+    for pause_s, v_mps in ((0, 0.0), (100, 0.5)):
+        t_ns += pause_s * 10**9
+        for k in range(500):
+            t_ns, x_m = t_ns + 10**7, x_m + 0.01 * v_mps
+            estimator.add_wheels(t_ns, v_mps, v_mps)
+            if k % 20 == 0:
+                estimator.add_gnss(t_ns, [*rng.normal([x_m, 0.0], 0.02), 0.0], 0.02)
+            estimator.add_imu(t_ns, rng.normal(0.0, 1e-3, 3), rng.normal(0.0, 1e-2, 3) + GRAVITY)
+    assert 40 < made[0] < 200
+
+
+def test_an_hour_without_fixes_or_wheels_fills_no_memory(husky: Estimator) -> None:
+    learning = husky.learned.calibration
+    assert learning is not None
+    for k in range(36_000):
+        learning.drive(k * 10**8, 0.1, 0.0, np.array([0.1 * k, 0.0]), 0.0)
+        learning.advance()
+    assert len(learning._samples) < 5000
+    waiting = Estimator.for_vehicle("husky")
+    for k in range(20_000):
+        waiting.add_imu(k * 10**7, np.zeros(3), GRAVITY)
+    assert len(waiting.imu.t_ns) < 1000
+
+
+def test_odometry_is_the_same_whenever_it_is_asked_for(drive: Recording) -> None:
+    """Restored from a dump it is computed for the first time; the running one has carried its state on."""
+    running, compared = Estimator.for_vehicle("husky"), 0
+    for i, message in enumerate(drive.messages()):
+        running.add(message)
+        now = running.odometry()
+        if now is not None and i % 301 == 0:
+            fresh = Estimator.restore(running.config, running.dump()).odometry()
+            assert fresh is not None
+            compared += 1
+            for name in ("position_m", "quaternion", "covariance", "twist_covariance"):
+                np.testing.assert_array_equal(getattr(now, name), getattr(fresh, name), err_msg=f"{i} {name}")
+    assert compared > 20
