@@ -39,7 +39,7 @@ def test_fixes_that_wait_are_corrected_with_those_to_come() -> None:
     fix = GnssFix(10**10, np.zeros(3), np.ones(3), Fix.SINGLE)
     gnss.queue(fix)
     gnss.correct(10**10, np.zeros(2), LATE_S)
-    gnss.queue(fix)
+    gnss.queue(dataclasses.replace(fix, enu_m=np.ones(3)))
     assert [waiting.t_ns for waiting in gnss.waiting] == [10**10 - int(LATE_S * 1e9)] * 2
     gnss.correct(10**10, np.zeros(2), 1.0)
     assert [waiting.t_ns for waiting in gnss.waiting] == [9 * 10**9] * 2

@@ -12,7 +12,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from terrafusion.datasets.readers.ros.arriving import DEFINITIONS, KINDS
+from terrafusion.datasets.readers.ros.arriving import KINDS
+from terrafusion.datasets.readers.ros.streams import DEFINITIONS
 from terrafusion.datasets.readers.ros.topics import TYPES as CHANNEL_TYPES
 from terrafusion.fusion.live.node import LiveNode, LiveOptions
 from terrafusion.fusion.live.published import TYPES, Frames
