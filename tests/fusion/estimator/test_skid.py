@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.messages import GnssSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -214,3 +215,24 @@ def test_a_refutation_that_does_not_help_keeps_no_fix_out() -> None:
     assert max(map(len, runs)) <= 4
     assert found.rejected_gnss <= 16
     assert rms_m(found) < 0.1
+
+
+def test_wheels_that_slipped_through_an_outage_are_soon_used_again() -> None:
+    """They erred alike for half a minute; taken for a random walk, that would be a metre within a second."""
+    drive = simulate("waypoints", terrain="asphalt", seed=4)
+    assert drive.wheels is not None
+    t_s = 1e-9 * (drive.wheels.t_ns - drive.start_ns)
+    speed = drive.wheels.speed * np.where((t_s > 30.0) & (t_s < 58.0), 1.33, 1.0)[:, None]
+    slipping = dataclasses.replace(
+        drive, wheels=dataclasses.replace(drive.wheels, speed=speed, angle_rad=None)
+    )
+    estimator, rates = Estimator.for_vehicle("elevate"), list[float]()
+    for message in slipping.messages():
+        at_s = 1e-9 * (message.t_ns - drive.start_ns)
+        if at_s > 65.0:
+            break
+        if not (isinstance(message, GnssSample) and 30.0 < at_s < 55.0):
+            estimator.add(message)
+        rates.append(estimator.gnss.skid.rate_m2ps)
+    assert estimator.gnss.skid.refutations == 1
+    assert 0.0 < max(rates) < 0.1
