@@ -8,6 +8,7 @@ from pathlib import Path
 from terrafusion.datasets.checks import Finding, run_checks
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.assumptions import Assumption, assumptions
@@ -109,6 +110,11 @@ def replay(
     """
     wheels_of(recording)  # refused before a vehicle is asked for
     params, vehicle_notes = choose_vehicle(recording, vehicle)
+    if grounds is not None and grounds.robot not in ("", params.name):
+        raise ConfigError(
+            f"the memory of grounds is that of '{grounds.robot}', the robot here is '{params.name}'",
+            remedy="keep one memory a robot, or give the vehicle by that name",
+        )
     used, held_out = split_fixes(recording, outages)
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = sensor_config_of(recording, used)
@@ -123,6 +129,8 @@ def replay(
         config, given, batch, progress, watch
     )
     notes += (*run_notes, *notes_of(estimator))
+    if magnetometer and recording.magnetometer is None:
+        notes += ("the log has no magnetometer: none is used",)
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
     changes = [*history.changes, *estimator.weights.take_changes()]
@@ -130,8 +138,9 @@ def replay(
 
     outages = tuple(outages)
     scores, alone, verdict = judged(
-        recording, estimate, estimator, config.rig, used, held_out, outages, findings
-    )
+        recording, estimate, estimator, config.rig, used, held_out, outages, findings,
+        frozenset(one.name for one in assumed),
+    )  # fmt: skip
     learned_grounds = estimator.weights.learned_grounds()
     if learned_grounds is not None and not learned_grounds.robot:
         learned_grounds.robot = params.name
@@ -151,9 +160,11 @@ def judged(
     held_out: Gnss | None = None,
     outages: Sequence[Outage] = (),
     findings: Sequence[Finding] | None = None,
+    assumed: frozenset[str] = frozenset(),
 ) -> tuple[Scores, Baselines, Verdict]:
     """Errors of an estimate against the truth or the fixes held out, those of wheels and gyro, and of the
-    receiver, alone, and the verdict; `findings` are those of the log checks, where they are known already."""
+    receiver, alone, and the verdict; `findings` are those of the log checks, where they are known already,
+    `assumed` the names of numbers that nobody gave."""
     local = estimator.gnss.unplaced
     scores = score(
         estimate, recording, held_out=held_out, outages=outages, antenna_m=estimator.gnss.antenna_places,
@@ -162,7 +173,9 @@ def judged(
     alone = baselines(recording, estimate, scores, used, outages, rig=rig, aligned=local)
     found = run_checks(recording, rig) if findings is None else findings
     corrections = estimator.learned.corrections()
-    return scores, alone, judge(Run(recording, estimate, scores, alone, used, found, rig, corrections))
+    imu = estimator.config.inputs.imu
+    run = Run(recording, estimate, scores, alone, used, found, rig, corrections, imu, assumed)
+    return scores, alone, judge(run)
 
 
 def _run_estimator(

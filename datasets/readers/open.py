@@ -50,6 +50,8 @@ def open_recordings(
     Raises:
         TerrafusionError: in one line the file, the channel, the time where known, and the remedy.
     """
+    if not isinstance(path, (str, Path)):
+        raise DataError(f"a {type(path).__name__} is no path of a log", remedy="give a path or a name")
     if stamps not in STAMPS:
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
     if not (topics is None or isinstance(topics, Mapping)):

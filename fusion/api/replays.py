@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.grounds.file import read_grounds
@@ -104,6 +105,8 @@ def replay(
         'adaptive'
     """
     known = None if vehicle is None else as_vehicle(vehicle)
+    if not (grounds is None or isinstance(grounds, (str, Path, GroundMemory))):
+        raise ConfigError(f"grounds is {grounds!r}", remedy="give a file, or the `grounds` of a result")
     (recording,) = opened(log, None if known is None else known.rig())
     if isinstance(terrain_model, (str, Path)):
         terrain_model = load_terrain_model(Path(terrain_model))

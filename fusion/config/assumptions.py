@@ -11,7 +11,7 @@ import numpy as np
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS, STEERED_DRIVES
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.twin.model.vehicle import VehicleParams, vehicle_names
 from terrafusion.twin.model.vehicle_file import read_vehicle
@@ -33,6 +33,7 @@ class RobotNumber:
 NUMBERS = {
     "wheel_radius_m": RobotNumber(("odometry", "wheel_radius_m"), "wheel_radius_m", "m", 0.05),
     "track_m": RobotNumber(("odometry", "track_m"), "track_m", "m", 0.2),
+    "wheelbase_m": RobotNumber(("body", "wheelbase_m"), "wheelbase_m", "m", 0.5),
     "antenna_m": RobotNumber(("sensors", "gnss", "antenna_m"), "antenna_m", "m", 0.3),
     "imu_m": RobotNumber(("sensors", "imu", "position_m"), "imu_m", "m", 0.2),
 }
@@ -92,6 +93,7 @@ def _of_the_vehicle(
     needed = {
         "wheel_radius_m": wheels is not None and wheels.unit == "radps",
         "track_m": inputs.sides,
+        "wheelbase_m": vehicle.drive.type in STEERED_DRIVES,
         "antenna_m": used is not None and bool(len(used)),
         "imu_m": inputs.imu == "six_axis",
     }

@@ -35,8 +35,7 @@ MEMORY_S = 10.0
 FORGOTTEN_S = 20.0
 """Time constant without fixes (assumed: the next ground is another one)."""
 SLIDE_S = 1.0
-"""Time for which wheels that slipped through an outage go on to err alike, as far as fixes then do not show it
-(assumed)."""
+"""Time for which wheels that slipped through an outage err alike afterwards (assumed)."""
 UNAIDED_S, NO_SKID_S = 5.0, 30.0
 """Driving without an accepted fix from which the mean rate of the drive holds at least; and the driving
 without a skid that the mean begins with (assumed)."""
@@ -119,7 +118,7 @@ class SkidDetector:
         passed = [(i, n.wheels, n.link) for i, n in enumerate(nodes, begin + 1)]
         self._before = self.rate_m2ps, self.by_rejection, passed
         self.by_rejection |= rejected
-        # Over a long outage the wheels erred in one direction: within a second that is less than a random walk.
+        # Over a long outage wheels err in one direction: within a second that is less than a random walk.
         unaided_s = (chain.node(k).t_ns - since_ns) * 1e-9
         share = driven_s * SLIDE_S / unaided_s**2 if unaided_s > UNAIDED_S else 1.0
         self.rate_m2ps += share * more_m2ps

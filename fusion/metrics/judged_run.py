@@ -21,7 +21,12 @@ STRAY_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a verdict is passed on."""
+    """What a verdict is passed on.
+
+    Attributes:
+        imu: which of the IMU's axes the estimator uses (`SensorConfig.imu`).
+        assumed: names of the robot's numbers that nobody gave.
+    """
 
     recording: Recording
     estimate: Estimate
@@ -31,6 +36,8 @@ class Run:
     findings: Sequence[Finding]
     rig: Rig
     corrections: Corrections = field(default_factory=Corrections)
+    imu: str = "six_axis"
+    assumed: frozenset[str] = frozenset()
 
 
 Reason = tuple[str, str]

@@ -17,6 +17,8 @@ does not estimate delays of IMU and wheels: an offset of their clocks counts, to
 LEARNED = {("imu-forward", "imu"): "imu_yaw_rad", ("clock-offset", "gnss"): "gnss_delay_s"}
 """The number of the robot that settles a finding of the log checks where the estimator corrected it, by code
 and channel."""
+OF_ACCELEROMETER = ("imu-forward", "accel-mirrored")
+"""Findings about axes that a planar graph does not use."""
 DELAY_SIGMAS = 2.0
 """A delay of the fixes is likely from so many of its sigmas on (95 %)."""
 LEAST_STEP_M = 1e-4
@@ -35,11 +37,23 @@ def log_checks(run: Run) -> Iterator[Reason]:
     for finding in run.findings:
         if LEARNED.get((finding.code, finding.channel)) in run.corrections.numbers:
             continue
+        if run.imu != "six_axis" and finding.code in OF_ACCELEROMETER:
+            continue
         clock = finding.code == "clock-offset" and finding.channel in ("imu", "wheels")
         if finding.severity == "error" or finding.code in REPORTED or clock:
             yield doubtful(
                 f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
             )
+
+
+def unknown_wheelbase(run: Run) -> Iterator[Reason]:
+    """A car whose wheelbase nobody gave: the body's origin is half of it ahead of the rear axle."""
+    if run.rig.drive == "ackermann" and "wheelbase_m" in run.assumed:
+        yield doubtful(
+            f"the distance of the axles is assumed ({run.rig.wheelbase_m:g} m): an error of it shifts "
+            "positions along the robot and passes for another place of the antenna; give `wheelbase_m` in "
+            "the vehicle file or the log"
+        )
 
 
 def delayed(run: Run) -> Iterator[Reason]:

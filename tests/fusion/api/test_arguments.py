@@ -10,8 +10,13 @@ import numpy as np
 import pytest
 
 import terrafusion as tf
+from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.readers.logs import opened
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.config.assumptions import assumptions
+from terrafusion.fusion.config.sensor_config import sensor_config_of
+from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.twin.model.choose import choose_vehicle
 from tests.datasets.ros_bags import MAKE1, imu_messages, write_ros1
 
 MOUNTED = 'robot: {extends: elevate, imu_axes: ["-z", "-x", "+y"], imu_frame: front_imu}\n'
@@ -128,3 +133,35 @@ def test_an_effect_by_its_short_name_replaces_that_of_the_vehicle() -> None:
     assert short is not None
     assert full is not None
     assert np.array_equal(short.speed, full.speed)
+
+
+def test_a_memory_of_grounds_is_of_one_robot(log: tf.Recording) -> None:
+    other = GroundMemory(robot="husky")
+    with pytest.raises(tf.ConfigError, match="the memory of grounds is that of 'husky', the robot here is"):
+        tf.replay(log, grounds=other)
+    with pytest.raises(tf.ConfigError, match="grounds is 3"):
+        tf.replay(log, grounds=3)  # type: ignore[arg-type]
+
+
+def test_a_magnetometer_that_is_not_there_is_missed(log: tf.Recording) -> None:
+    assert log.magnetometer is None
+    result = tf.replay(log, magnetometer=True)
+    assert any("no magnetometer" in note for note in result.estimate.notes)
+
+
+def test_a_recording_is_open_already(log: tf.Recording) -> None:
+    with pytest.raises(tf.DataError, match="a Recording is no path of a log"):
+        tf.open(log)  # type: ignore[arg-type]
+
+
+def test_a_car_of_unknown_wheelbase_says_so() -> None:
+    car = dataclasses.replace(
+        tf.simulate("straight"),
+        vehicle=None,
+        overrides=Overrides(drive="ackermann", wheel_radius_m=0.17, track_m=1.0),
+    )
+    for given, assumed in ((None, True), (1.8, False)):
+        one = dataclasses.replace(car, overrides=dataclasses.replace(car.overrides, wheelbase_m=given))
+        vehicle, _ = choose_vehicle(one, None)
+        found = assumptions(one, None, vehicle, sensor_config_of(one, one.gnss), one.gnss)
+        assert any(a.name == "wheelbase_m" for a in found) == assumed

@@ -26,14 +26,23 @@ RIG = load_vehicle("elevate").rig()
 
 def verdict(
     d, *, truth=True, estimate=None, baselines=None, findings=(), outages=(), held_out=None,
-    corrections=None,
+    corrections=None, **known,
 ) -> Verdict:  # fmt: skip
     estimate = estimate or d.estimate
     recording = d.recording if truth else dataclasses.replace(d.recording, truth=None)
     scores = score(estimate, recording, held_out=held_out, outages=outages)
     alone, corrections = baselines or Baselines(), corrections or Corrections()
     return judge(
-        Run(recording, estimate, scores, alone, d.fixes, findings, RIG, corrections or Corrections())
+        Run(
+            recording,
+            estimate,
+            scores,
+            alone,
+            d.fixes,
+            findings,
+            **({"rig": RIG} | known),
+            corrections=corrections,
+        )
     )
 
 
@@ -329,6 +338,23 @@ def test_a_correction_is_judged_by_the_sigma_along_its_shift(drive, antenna, axi
     estimate = dataclasses.replace(consistent(d), trajectory=wide)
     found = verdict(d, truth=False, estimate=estimate, corrections=Corrections(antenna=places(d, **antenna)))
     assert found.value == value, found
+
+
+@pytest.mark.parametrize(("imu", "value"), [("six_axis", "doubtful"), ("gyro_z", "good")])
+@pytest.mark.parametrize("code", ["imu-forward", "accel-mirrored"])
+def test_axes_that_the_graph_does_not_use_are_no_reason(drive, code, imu, value):
+    found = Finding(code, "warning", "imu", "x does not point forward", "90 deg", "turn it")
+    d = drive()
+    assert verdict(d, truth=False, estimate=consistent(d), findings=[found], imu=imu).value == value
+
+
+@pytest.mark.parametrize(("kind", "value"), [("ackermann", "doubtful"), ("differential", "good")])
+def test_a_car_whose_wheelbase_nobody_gave_is_not_good(drive, kind, value):
+    d, rig, assumed = drive(), dataclasses.replace(RIG, drive=kind), frozenset(["wheelbase_m", "imu_m"])
+    found = verdict(d, truth=False, estimate=consistent(d), rig=rig, assumed=assumed)
+    assert found.value == value
+    assert ("wheelbase_m" in " ".join(found.reasons)) == (value == "doubtful")
+    assert verdict(d, truth=False, estimate=consistent(d), rig=rig).value == "good"
 
 
 @pytest.mark.parametrize(("after_s", "value"), [(15.0, "doubtful"), (0.5, "good")])
