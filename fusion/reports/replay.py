@@ -68,6 +68,7 @@ def write_report(
     calibrations = {m["mode"]: [cells(row) for row in m["calibration"]] for m in metrics}
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(first, provenance),
+        grounds_known=style.grounds_known(shown.estimate),
         names=names, shown=shown, other=names[pair[1]], pair=pair, compared=compared,
         scores=rows, baselines=replay_text.shown_baselines(rows),
         tiles=replay_text.tiles(rows, names, pair[0]), **sheet.parts(), innovations=innovations,

@@ -13,7 +13,6 @@ from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
-from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 _SIGMAS = (
     ("wheel_sigma_mps", "wheel speed, m/s", "wheels", "solid"),
@@ -188,12 +187,10 @@ def change_numbers(changes: Sequence[WeightChange]) -> dict[int, int]:
 
 def _shade_terrain(plot: Plot, estimate: Estimate, t_s: Array) -> None:
     """Colour the background by the most probable class."""
-    if not len(t_s) or not estimate.classes:
+    if not style.grounds_known(estimate):
         return
     rows = style.thin(len(t_s), 600)
     label, t_s = estimate.dominant_terrain()[rows], t_s[rows]
-    if (label == UNKNOWN).all():
-        return
     runs = style.runs_of(label)
     strips: dict[str, list[tuple[float, float]]] = {}
     for first, last in runs:

@@ -14,7 +14,6 @@ from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.outputs.replay_files import is_local
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.sheet import Plot, Sheet
-from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the ellipses; two dimensions have 1 - exp(-2) = 86 % of their probability inside."""
@@ -128,11 +127,9 @@ def _ground(plot: Plot, estimate: Estimate) -> None:
     """A wide line below the path, in the colour of the most probable class."""
     rows = style.thin(len(estimate.trajectory), MOST)
     xy = estimate.trajectory.position_m[rows, :2]
-    if len(xy) < 2 or not estimate.classes:
+    if len(xy) < 2 or not style.grounds_known(estimate):
         return
     label = estimate.dominant_terrain()[rows]
-    if (label == UNKNOWN).all():
-        return
     lines: dict[str, list[Array]] = {}
     for first, last in style.runs_of(label):
         lines.setdefault(str(label[first]), []).append(xy[first : last + 1])

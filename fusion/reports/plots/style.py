@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 TERRAIN_COLOURS = {
     "asphalt": "#4d4d4d",
@@ -85,6 +87,11 @@ def label_text(text: object, limit: int = 60) -> str:
     """Text from a log for a label: one short line."""
     words = " ".join(str(text).split()) or "unnamed"
     return words if len(words) <= limit else words[: limit - 1] + "…"
+
+
+def grounds_known(estimate: Estimate) -> bool:
+    """Whether a class of the policy is the most probable one of any keyframe."""
+    return bool(estimate.classes) and bool((estimate.dominant_terrain() != UNKNOWN).any())
 
 
 def thin(n: int, most: int = MAX_POINTS, keep: Iterable[int] = ()) -> NDArray[np.int64]:
