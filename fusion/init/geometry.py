@@ -13,6 +13,7 @@ from terrafusion.fusion.config.assumptions import NUMBERS
 from terrafusion.fusion.config.sensor_config import imu_kind
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine
+from terrafusion.fusion.init.wheelbase import measured_wheelbase
 from terrafusion.twin.model.vehicle import VehicleParams
 
 LEAST_RADIUS_SIGMA, LEAST_TRACK_SIGMA = 0.005, 0.03
@@ -43,8 +44,10 @@ USUAL = {
 """Where a vehicle has the number that is assumed of another robot."""
 
 
-def geometry_lines(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
-    """The lines of drive, track, sensors' places and mass; the arguments as in `radius_line`."""
+def geometry_lines(
+    recording: Recording, measured: Measures, answers: Answers, base: VehicleParams, wheel_radius_m: float
+) -> Draft:
+    """The lines of drive, track, axles, sensors' places and mass; the arguments as in `radius_line`."""
     drive = _drive(recording, answers, base)
     others = {
         "wheelbase_m": drive.value in STEERED_DRIVES,
@@ -53,7 +56,13 @@ def geometry_lines(recording: Recording, measured: Measures, answers: Answers, b
         "mass_kg": True,
     }
     lines = {"drive": drive} | _track(recording, measured.yaw, answers, base, str(drive.value))
-    return lines | {name: _given(name, recording, answers, base) for name, wanted in others.items() if wanted}
+    lines |= {name: _given(name, recording, answers, base) for name, wanted in others.items() if wanted}
+    known = answers.wheelbase_m is not None or recording.overrides.wheelbase_m is not None
+    found = measured_wheelbase(recording, wheel_radius_m) if others["wheelbase_m"] and not known else None
+    if found is not None:
+        number = KnownNumber(round(found[0], 3), "calibrated", round(found[1], 3), (recording.name,))
+        lines["wheelbase_m"] = DraftLine(number, "m; steering angles against the gyro")
+    return lines
 
 
 def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> DraftLine:

@@ -150,10 +150,12 @@ def _geometry(
     """What is measured between the channels, and the lines of the geometry that follow."""
     measured = measure([recording], rig)
     lines = radius_line(recording, measured, answers, base)
+    radius_m = rig.wheel_radius_m
     for line in list(lines.values()):  # the effective track scales with it
         if isinstance(line.value, KnownNumber):
-            measured = measure([recording], dataclasses.replace(rig, wheel_radius_m=line.value.number))
-    lines |= geometry_lines(recording, measured, answers, base)
+            radius_m = line.value.number
+            measured = measure([recording], dataclasses.replace(rig, wheel_radius_m=radius_m))
+    lines |= geometry_lines(recording, measured, answers, base, radius_m)
     if base.name != "generic":  # what nobody measured here is better known in its own file
         lines = {name: line for name, line in lines.items() if not line.assumed}
     return measured, lines

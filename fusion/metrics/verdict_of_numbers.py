@@ -51,8 +51,8 @@ def unknown_wheelbase(run: Run) -> Iterator[Reason]:
     if run.rig.drive == "ackermann" and "wheelbase_m" in run.assumed:
         yield doubtful(
             f"the distance of the axles is assumed ({run.rig.wheelbase_m:g} m): an error of it shifts "
-            "positions along the robot and passes for another place of the antenna; give `wheelbase_m` in "
-            "the vehicle file or the log"
+            "positions along the robot and passes for another place of the antenna; give `wheelbase_m`, "
+            "or let `terrafusion init LOG` measure it"
         )
 
 
