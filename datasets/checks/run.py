@@ -124,9 +124,10 @@ def repair(recording: Recording, rig: Rig | None = None) -> tuple[Recording, lis
         if first is None or first.repair is None:
             break
         note = f"repaired: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
-        recording = first.repair(recording).with_notes(note)
-        if first.code in ("imu-axes", "imu-forward"):  # else the vehicle would turn it again
-            recording = dataclasses.replace(recording, unturned=())
+        before, recording = recording, first.repair(recording).with_notes(note)
+        if first.code in ("imu-axes", "imu-forward"):  # what is turned now, a vehicle must not turn again
+            still = tuple(n for n in before.unturned if getattr(recording, n) is getattr(before, n))
+            recording = dataclasses.replace(recording, unturned=still)
         repaired.append(first)
     return recording, repaired
 

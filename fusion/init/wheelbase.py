@@ -12,13 +12,13 @@ LEAST_MPS, LEAST_MEANS = 0.2, 20
 """Slower means show nothing, and fewer are too few (assumed)."""
 LEAST_R, LEAST_SIGMA = 0.95, 0.15
 """Correlation below which the angles are no measurement of these wheels, such as late commands; and the least
-relative 1 sigma: tyres that slip make the distance seem larger, by 3 to 30 % with grounds (assumed)."""
+relative 1 sigma: tyres that slip make the distance seem larger, by 3 to 40 % with the ground (assumed)."""
 
 
 def measured_wheelbase(recording: Recording, wheel_radius_m: float) -> tuple[float, float] | None:
     """Distance of the axles, m, and its 1 sigma; None where the log does not show it.
 
-    By the bicycle model without side-slip (Rajamani 2012, Vehicle Dynamics and Control, eq. 2.7),
+    By the bicycle model without side-slip (Rajamani 2012, Vehicle Dynamics and Control, ch. 2.2),
 
         v (tan front - tan rear) = L (r - b) + v c,
 

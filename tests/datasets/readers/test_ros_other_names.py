@@ -13,6 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import get_types_from_msg
 
 from terrafusion.datasets.checks import repair
+from terrafusion.datasets.core.channels import Imu, Magnetometer
 from terrafusion.datasets.core.conventions import turned_as_mounted
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
@@ -147,6 +148,21 @@ def test_a_repaired_imu_is_not_turned_once_more(mounted: Recording) -> None:
     (found,) = opened(repaired, load_vehicle("husky").rig())
     assert found.imu is not None
     np.testing.assert_allclose(found.imu.accel_mps2[0], [0.0, 0.0, 9.81], atol=1e-6)
+
+
+@pytest.mark.parametrize(("angle_deg", "left"), [(90.0, ()), (30.0, ("magnetometer",))])
+def test_a_repair_leaves_to_the_vehicle_what_it_did_not_turn(angle_deg: float, left: tuple[str, ...]) -> None:
+    """By a quarter the magnetometer is turned with the IMU, by another angle the IMU alone."""
+    drive = simulate("figure_eight", terrain="asphalt", seed=1)
+    assert drive.imu is not None
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    imu = Imu(drive.imu.t_ns, drive.imu.gyro_radps @ R.T, drive.imu.accel_mps2 @ R.T)
+    field = Magnetometer(drive.imu.t_ns, np.tile([2e-5, 0.0, -4e-5], (len(drive.imu), 1)))
+    unturned = ("imu", "magnetometer")
+    repaired, findings = repair(dataclasses.replace(drive, imu=imu, magnetometer=field, unturned=unturned))
+    assert "imu-forward" in {finding.code for finding in findings}
+    assert repaired.unturned == left
 
 
 def test_an_unknown_sigma_of_heights_stays_unknown(tmp_path: Path) -> None:
