@@ -18,7 +18,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, read_table
-from terrafusion.datasets.readers.formats import Request, logs_in
+from terrafusion.datasets.readers.formats import HEAD_BYTES, Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.timed_tables import in_time
 
@@ -62,13 +62,22 @@ def _as_one(logs: Sequence[str]) -> str:
         return ""
     if all(name.endswith((".mcap", ".db3")) for name in logs):
         return "; if they are one bag, `ros2 bag reindex` writes its metadata.yaml"
-    return "; if they are of one drive, join them (Plain tables in docs/reference/formats.md)"
+    return "; for one drive, write a column map beside each table (Plain tables in docs/reference/formats.md)"
+
+
+def _is_channel(path: Path) -> bool:
+    """Whether a file has the time column of a log folder's tables."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    return path.suffix == ".gz" or b"t_s" in head.split(b"\n", 1)[0]
 
 
 def _meta(folder: Path) -> Meta:
     """`meta.yaml`, with the path of a vehicle file that lies in the folder."""
     if not (folder / META).is_file():
-        is_log = any((folder / f"{name}.csv{gz}").is_file() for name in CHANNELS for gz in ("", ".gz"))
+        is_log = any(_is_channel(folder / f"{name}.csv{gz}") for name in CHANNELS for gz in ("", ".gz"))
         logs = [] if is_log else logs_in(folder)
         remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
         if logs:

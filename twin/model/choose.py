@@ -51,7 +51,7 @@ def choose_vehicle(
         raise DataError(
             f"{which}, and the log lacks its {' and '.join(missing)}",
             file=recording.name,
-            remedy=f"give {' and '.join(missing)} in meta.yaml, or --vehicle with one of "
+            remedy=f"give {' and '.join(missing)} in meta.yaml or a column map, or --vehicle with one of "
             f"{', '.join(vehicle_names())} or a YAML file: `terrafusion init LOG` writes one",
         )
     steered, wheelbase_m = overrides.drive in STEERED_DRIVES, overrides.wheelbase_m

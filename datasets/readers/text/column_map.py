@@ -48,8 +48,10 @@ GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 FIELDS = {channel: (*columns.numbers, *columns.texts) for channel, columns in COLUMNS.items()}
 FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"])
 FIELDS["truth"] = (*FIELDS["truth"][:3], "yaw_rad", *FIELDS["truth"][3:])
-"""Fields of each channel: the columns of the log folder, latitude and longitude, and a plain yaw.
-`terrain` also takes p_<class>."""
+YAW_RATE = "yaw_rate_radps"
+FIELDS["wheels"] = (*FIELDS["wheels"], YAW_RATE)
+"""Fields of each channel: the columns of the log folder, latitude and longitude, a plain yaw, and the yaw
+rate of wheel odometry beside its speed. `terrain` also takes p_<class>."""
 
 TEXT_FIELDS = ("fix", "label")
 FIX_CODES = ("", *FIX_OF_CODE)
@@ -114,11 +116,17 @@ class TimeColumn:
     """The time column: decimal numbers in `unit` since `epoch`, or ISO 8601.
 
     `epoch` is unix, gps (leap seconds are taken off), none (no calendar), or an instant in ISO 8601.
+    `nanoseconds` is the column with the rest below a second, where the times are split, "" for none.
     """
 
     column: str
     unit: Annotated[str, Word(TIME_UNITS)] = "s"
     epoch: str = "unix"
+    nanoseconds: str = ""
+
+    def columns(self) -> list[str]:
+        """Names of the columns that hold the times."""
+        return [self.column, *([self.nanoseconds] if self.nanoseconds else [])]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +166,7 @@ class ColumnMap(ColumnMapFile):
     def columns(self) -> list[str]:
         """Names of all columns that are asked for, each once."""
         fields = (of.column for channel in self.channels.values() for of in channel.values())
-        return list(dict.fromkeys([self.time.column, *fields]))
+        return list(dict.fromkeys([*self.time.columns(), *fields]))
 
     def words(self) -> set[str]:
         """Names of the columns that hold words."""
@@ -209,6 +217,8 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
     if found.time.epoch not in EPOCHS and not _is_instant(found.time.epoch):
         instant = "an instant such as 2024-05-01T12:00:00Z, in quotes"
         yield f"'time.epoch' is '{shown(found.time.epoch)}'", f"give {', '.join(EPOCHS)} or {instant}"
+    if found.time.nanoseconds and found.time.unit == "iso8601":
+        yield "'time' has nanoseconds beside iso8601", "remove them"
     if len(found.separator) > 1:
         yield f"'separator' is '{shown(found.separator)}'", "give one character"
     try:
@@ -227,6 +237,8 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
             continue
         for name, of in fields.items():
             yield from _field_problems(channel, name, of)
+        if YAW_RATE in fields and {*fields} != {YAW_RATE, "speed_mps"}:
+            yield f"'wheels' has {', '.join(fields)}", f"{YAW_RATE} stands beside speed_mps alone"
         if channel == "gnss" and bool({"east_m", "north_m"} & set(fields)) == ("latitude_deg" in fields):
             yield (
                 "'gnss' has no position, or two",

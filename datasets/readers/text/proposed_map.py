@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, units_of
+from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, YAW_RATE, units_of
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
@@ -32,7 +32,7 @@ _WORDS = {
     "s": "s|sec|secs|seconds",
     "ms": "ms|msec|millis",
     "us": "us|µs|usec|micros",
-    "ns": "ns|nsec|nanos|nanosec",
+    "ns": "ns|nsec|nsecs|nanos|nanosec",
 }
 UNIT_OF = {word: unit for unit, words in _WORDS.items() for word in words.split("|")}
 UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", "mA", "Pa", "hPa")}
@@ -62,7 +62,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"lat(?:itude)?", "gnss", ("latitude_deg",)),
     (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
     (r"alt|altitude|height|h", "gnss", ("height_m",)),
-    (r"(?:fix_)?qual(?:ity)?|q", "gnss", ("fix",)),
+    (r"(?:fix_)?qual(?:ity)?|q|status_status", "gnss", ("fix",)),
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
@@ -81,7 +81,8 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ),
     *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
     *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
-    (r"v|vel|velocity|speed|wheel_speed", "wheels", ("speed_mps",)),
+    (r"v|vel|velocity|speed|wheel_speed|(?:twist_)?linear_x", "wheels", ("speed_mps",)),
+    (r"w|omega|(?:twist_)?angular_z", "wheels", (YAW_RATE,)),
     (r"steer(?:ing)?_wheel(?:_angle)?", "steering", ("steering_wheel_rad",)),
     (r"steer(?:ing)?(?:_angle)?", "steering", ("angle_rad",)),
     *(
@@ -94,6 +95,11 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 """Names of columns that people often use, the channel, and its fields that they may stand for."""
 _LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
 """Names of a horizontal accuracy, which stands for the sigma of both axes."""
+_MESSAGE = re.compile(
+    r"(?:.*_)?(angular_velocity_[xyz]|linear_acceleration_[xyz]|twist_(?:linear_x|angular_z)"
+    r"|latitude|longitude|altitude|status_status|header_stamp)"
+)
+"""Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
 _TOGETHER = (
@@ -124,11 +130,13 @@ class _Header:
 def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
     """A first column map, on one line, for the user to correct; the first row's cells tell units."""
     headers = [_header(name) for name in names]
-    time = next((h for h in headers if _TIME.search(h.base)), headers[0])
+    times = [h for h in headers if _TIME.search(h.base)]
+    time = next((h for h in times if h.base == "header_stamp"), [*times, headers[0]][0])
+    rest = _nanoseconds(time.column, names)
     cells = dict(zip(names, first, strict=False))
     channels: dict[str, dict[str, str]] = {}
     for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
-        if header.column == time.column:
+        if header.column in (time.column, rest):
             continue
         for channel, field in _guesses(header):
             if field not in channels.get(channel, {}):
@@ -139,7 +147,7 @@ def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
         f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
         for channel, fields in channels.items()
     )
-    return f"time: {_time_entry(time, cell)}, channels: {{{sections}}}"
+    return f"time: {_time_entry(time, cell, rest)}, channels: {{{sections}}}"
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
@@ -190,6 +198,8 @@ def _header(name: str) -> _Header:
                 break
     if known == "ticks" and not bracketed:
         base = f"{base}_ticks"
+    if path := _MESSAGE.fullmatch(base) if re.search(r"[./]", name) and "cmd" not in base else None:
+        base = path[1]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
     return _Header(name, re.sub(r"^(imu|gps|gnss|odom|robot)_(?=.)", "", base), known)
@@ -216,7 +226,8 @@ def _entry(header: _Header, field: str) -> str:
     if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
         return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
     if field == "fix":
-        return f"{{column: {name}, unit: nmea}}"
+        codes = "navsatfix" if header.base.endswith("status") else "nmea"
+        return f"{{column: {name}, unit: {codes}}}"
     own = next(iter(units_of(field)))
     if header.column == field or header.unit in ("", own):
         return name
@@ -243,12 +254,19 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     if "latitude_deg" in gnss:
         found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
-    one = {"speed_mps": wheels["speed_mps"]} if "speed_mps" in wheels else {}
+    one = {name: wheels[name] for name in ("speed_mps", YAW_RATE) if "speed_mps" in wheels and name in wheels}
     found["wheels"] = {name: wheels[name] for name in layout} or one
     return {channel: fields for channel, fields in found.items() if fields}
 
 
-def _time_entry(time: _Header, cell: str) -> str:
+def _nanoseconds(time: str, names: Sequence[str]) -> str:
+    """The column of the nanoseconds that belong to one of seconds, "" where there is none."""
+    before, word, after = time.rpartition("sec")
+    pairs = [f"{before}{nano}{word}{after}" for nano in ("n", "nano")] if word else []
+    return next((name for name in pairs if name in names), "")
+
+
+def _time_entry(time: _Header, cell: str, rest: str) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
     value = number_in(cell.replace(",", "."))
@@ -260,4 +278,5 @@ def _time_entry(time: _Header, cell: str) -> str:
     unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "s")
     if abs(value) < 0.1 * size[unit]:
         epoch = "none"
-    return f"{{column: {name}, unit: {unit}, epoch: {epoch}}}"
+    split = f", nanoseconds: {json.dumps(rest, ensure_ascii=False)}" if rest else ""
+    return f"{{column: {name}, unit: {unit}, epoch: {epoch}{split}}}"

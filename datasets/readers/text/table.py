@@ -1,6 +1,7 @@
 """Plain tables, text or Parquet, with a column map."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +26,7 @@ from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
     GEODETIC,
     TEXT_FIELDS,
+    YAW_RATE,
     ColumnMap,
     MappedColumn,
     contract_map,
@@ -33,7 +35,7 @@ from terrafusion.datasets.readers.text.column_map import (
 )
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.proposed_map import TICKS, left_out, starter_map
-from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns
+from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
@@ -89,10 +91,15 @@ def _mapless(path: Path, names: list[str], first: list[str]) -> DataError:
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
     proposal = starter_map(names, first)
+    if names == numbered(len(names)):
+        proposal = f"header: none, {proposal}"
+        given = f"{', '.join(names)} (first row: {', '.join(first)})"
+    else:
+        given = ", ".join(names)
     ticks = f" ({TICKS}: how many ticks make a turn?)" if TICKS in proposal else ""
     unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
     return DataError(
-        f"nothing says what the columns {', '.join(names)} are",
+        f"nothing says what the columns {given} are",
         remedy=f"correct this proposal, whose fields and units are guesses{ticks}{unused} "
         "(entries: Plain tables in docs/reference/formats.md), and save it as "
         f"{path.name}{MAP_SUFFIX}: {{{proposal}}}",
@@ -108,16 +115,34 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
     t_s = times.t_ns - start_ns
-    tables = {name: _table(columns, of, times.order, t_s, request.path) for name, of in fields.items()}
+    track_m, track_notes = _odometry_track(request, column_map)
+    tables = {
+        name: _table(columns, of, times.order, t_s, request.path, track_m) for name, of in fields.items()
+    }
     reader = _Reader(tables, meta, rig=request.rig)
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
-    notes = [*notes, *time_notes, *columns.notes, *times.notes, *reader.notes]
+    notes = [*notes, *time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
     return apply(recording, column_map.conventions())
+
+
+def _odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, list[str]]:
+    """Track (m) of an odometry that gives speed and yaw rate, and a note; nan where it gives wheels.
+
+    Raises:
+        DataError: nobody gives it.
+    """
+    if YAW_RATE not in column_map.channels.get("wheels", {}):
+        return math.nan, []
+    track_m = request.rig.track_m if request.rig is not None else column_map.meta.track_m
+    if track_m is None:
+        remedy = "give track_m in the column map, or --vehicle; any keeps the yaw rate"
+        raise DataError("speed and yaw rate need the track", channel="wheels", remedy=remedy)
+    return track_m, [f"wheels: sides of speed and yaw rate, {track_m:g} m apart"]
 
 
 def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
@@ -126,6 +151,12 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
     if t_ns is None:
         return _iso_ns(columns, time.column)
+    if time.nanoseconds:
+        rest_ns = columns.times_ns(time.nanoseconds, "ns")
+        if rest_ns is None or (np.abs(rest_ns) >= 10**9).any():
+            what = f"column '{time.nanoseconds}' holds no nanoseconds below a second"
+            raise DataError(what, remedy="correct 'time' of the column map")
+        t_ns = t_ns + rest_ns
     late = np.flatnonzero(np.abs(t_ns) > MAX_NS)
     if late.size:
         raise DataError(
@@ -156,9 +187,15 @@ def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[s
 
 
 def _table(
-    columns: TableColumns, fields: Mapping[str, MappedColumn], order: Any, t_ns: TimesNs, path: Path
+    columns: TableColumns,
+    fields: Mapping[str, MappedColumn],
+    order: Any,
+    t_ns: TimesNs,
+    path: Path,
+    track_m: float,
 ) -> TimedTable:
-    """The mapped columns of a channel in SI units, its rows in the `order` of their times."""
+    """The mapped columns of a channel in SI units, its rows in the `order` of their times; speed and yaw rate
+    as the sides' speeds that an odometry of that track makes them of."""
     texts = {name: _words(columns, name, of)[order] for name, of in fields.items() if name in TEXT_FIELDS}
     numbers = {}
     for name, of in fields.items():
@@ -170,6 +207,9 @@ def _table(
         yaw = numbers.pop("yaw_rad")
         rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)
         numbers |= dict(zip(QUATERNION, rpy_to_quaternion(rpy).T, strict=True))
+    if YAW_RATE in numbers:
+        speed, half = numbers.pop("speed_mps"), 0.5 * track_m * numbers.pop(YAW_RATE)
+        numbers |= {"left_mps": speed - half, "right_mps": speed + half}
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 

@@ -47,7 +47,7 @@ class TextColumns:
 
     def read(self, column_map: ColumnMap) -> None:
         """Parse the mapped columns: times and words as text, all others as numbers."""
-        texts = {column_map.time.column, *column_map.words()}
+        texts = {*column_map.time.columns(), *column_map.words()}
         numbers = [name for name in column_map.columns() if name not in texts]
         self._table = read_columns(self.path, self._text, self._layout, numbers, sorted(texts))
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
@@ -71,8 +71,14 @@ class TextColumns:
         return self._table.times_ns(name, unit)
 
 
+def numbered(count: int) -> list[str]:
+    """Names of the columns of a table without a header."""
+    return [str(i) for i in range(1, count + 1)]
+
+
 def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
-    """Names from the first line that is no comment, or from the comment before a first line of numbers."""
+    """Names from the first line that is no comment, or from the comment before a first line of numbers;
+    without a map, a first line of numbers is a row."""
     comment, header, number = "", "", 0
     for at, line in head_lines(data):
         if line.startswith(COMMENT):
@@ -85,10 +91,13 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     separator = (column_map.separator if column_map else "") or separator_of(header)
     cells = split(header, separator)
     first_line = number + 1
+    named, row = split(comment, separator) if comment else [], all(map(_is_value, cells))
     if column_map is not None and column_map.header == "none":
-        cells, first_line = [str(i) for i in range(1, len(cells) + 1)], number
-    elif comment and len(split(comment, separator)) == len(cells) and all(map(_is_value, cells)):
-        cells, first_line = split(comment, separator), number
+        cells, first_line = numbered(len(cells)), number
+    elif row and len(named) == len(cells):
+        cells, first_line = named, number
+    elif row and column_map is None:
+        cells, first_line = numbered(len(cells)), number
     limits.check_columns(len(cells))
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 

@@ -118,7 +118,7 @@ def test_a_folder_of_logs_names_them(tmp_path: Path) -> None:
 def test_a_folder_of_several_logs_says_how_they_become_one(tmp_path: Path) -> None:
     for name in ("gps.csv", "imu_data.csv"):
         (tmp_path / name).write_text("a,b\n1,2\n")
-    with pytest.raises(DataError, match=r"gps.csv, imu_data.csv; if they are of one drive, join them"):
+    with pytest.raises(DataError, match=r"gps.csv, imu_data.csv; for one drive, write a column map beside"):
         open_recording(tmp_path)
     for number, name in enumerate(("gps.csv", "imu_data.csv")):
         (tmp_path / name).rename(tmp_path / f"d_{number}.mcap").write_bytes(b"\x89MCAP0\r\n")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 
 
@@ -85,3 +86,73 @@ def test_times_with_an_offset_are_not_said_to_have_none(offset: str, said: bool,
     path.with_name("log.csv.columns.yaml").write_text(columns, encoding="utf-8")
     notes = open_recording(path).notes
     assert any("without an offset" in note for note in notes) == said
+
+
+EXPORTS = {
+    "rostopic echo -p": (
+        "%time,field.header.stamp,field.orientation.x,field.angular_velocity.z,field.linear_acceleration.x\n"
+        "1700000000900000000,1700000000500000000,0,0.25,9\n",
+        ("imu", 1_700_000_000_500_000_000, 0.25),
+    ),
+    "times split into seconds and nanoseconds": (
+        "header.stamp.secs,header.stamp.nsecs,angular_velocity.z\n1700000000,500000000,0.25\n",
+        ("imu", 1_700_000_000_500_000_000, 0.25),
+    ),
+    "of ROS 2": (
+        "header.stamp.sec,header.stamp.nanosec,angular_velocity.z\n1700000000,500000000,0.25\n",
+        ("imu", 1_700_000_000_500_000_000, 0.25),
+    ),
+    "paths of topics": (
+        "__time,/imu/data/angular_velocity/z,/cmd_vel/linear/x\n1700000000.5,0.25,3\n",
+        ("imu", 1_700_000_000_500_000_000, 0.25),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", EXPORTS)
+def test_exports_of_ros_messages_are_proposed(kind: str, tmp_path: Path) -> None:
+    text, (channel, t_ns, rate) = EXPORTS[kind]
+    recording = opened_as_proposed(tmp_path, text)
+    assert list(recording.channels()) == [channel]
+    assert recording.imu is not None
+    assert recording.imu.t_ns.tolist() == [t_ns]
+    assert recording.imu.gyro_radps[0, 2] == rate
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["t,v,w", "t,field.twist.twist.linear.x,field.twist.twist.angular.z", "t,speed_mps,yaw_rate_radps"],
+)
+def test_speed_and_yaw_rate_are_the_sides_of_the_odometrys_track(names: str, tmp_path: Path) -> None:
+    text = f"{names}\n0,1.0,0.5\n1,2.0,-0.5\n"
+    with pytest.raises(DataError, match=r"wheels: speed and yaw rate need the track; give track_m"):
+        opened_as_proposed(tmp_path, text)
+    wheels = opened_as_proposed(tmp_path, text, track_m=0.6).wheels
+    assert wheels is not None
+    np.testing.assert_allclose(wheels.speed, [[0.85, 1.15], [2.15, 1.85]])
+
+
+def test_a_first_line_of_numbers_is_no_header(tmp_path: Path) -> None:
+    (path := tmp_path / "gps.csv").write_text(
+        "1700000000000000000,48.1,11.5\n1700000001000000000,48.1,11.6\n"
+    )
+    with pytest.raises(DataError, match=r"columns 1, 2, 3 \(first row: 1700.*header: none.*unit: ns"):
+        open_recording(path)
+
+
+def test_nanoseconds_beyond_a_second_are_refused(tmp_path: Path) -> None:
+    text = "secs,nsecs,wz\n1700000000,1500000000,0.1\n"
+    with pytest.raises(DataError, match="no nanoseconds below a second"):
+        opened_as_proposed(tmp_path, text)
+
+
+def opened_as_proposed(folder: Path, text: str, **keys: float) -> Recording:
+    """A table, opened by the map that the error without one proposes."""
+    path = folder / "drive.csv"
+    path.write_text(text)
+    (columns := folder / "drive.csv.columns.yaml").unlink(missing_ok=True)
+    with pytest.raises(DataError) as told:
+        open_recording(path)
+    given = "".join(f"{key}: {value}, " for key, value in keys.items())
+    columns.write_text("{" + given + str(told.value).split(".columns.yaml: {", 1)[1])
+    return open_recording(path)
