@@ -24,7 +24,7 @@ from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.bag import opened_bag, recording_of
-from terrafusion.datasets.readers.ros.mcap_file import McapFile
+from terrafusion.datasets.readers.ros.mcap_file import LANGUAGES, McapFile
 from terrafusion.datasets.readers.ros.raw import (
     BagContainer,
     BagError,
@@ -40,7 +40,6 @@ from terrafusion.datasets.readers.ros.raw import (
 METADATA = "metadata.yaml"
 SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
-LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 FETCHED_ROWS = 2048
 """Messages that are fetched at once."""
 STEPS_AT_A_TIME = 100_000

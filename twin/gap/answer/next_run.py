@@ -28,7 +28,8 @@ from terrafusion.twin.gap.infer.other_drives import RobotOffsets
 from terrafusion.twin.gap.infer.predictive import marginalise_robot_offsets, marginalise_run_offsets
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.score import Score, score
-from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
+from terrafusion.twin.gap.rollout.batch import SOIL_SIGMAS
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, residuals_from, whitened
 from terrafusion.twin.gap.rollout.sensitivities import Course, channel_sensitivities, linearise_all, turned
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.scenario.commands import open_loop

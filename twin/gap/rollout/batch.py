@@ -36,8 +36,9 @@ from terrafusion.twin.sensors.effects import DEAD_TIME
 Effects = Mapping[str, float]
 MotionEffects = tuple[tuple[str, float], ...]  # effects of a set that change the motion, with their values
 
-SOIL_KEYS = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
-"""Parameters by which the soil differs from run to run: in every graph."""
+SOIL_SIGMAS = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
+"""Soil parameters that vary from run to run, with their first 1 sigma in typical sizes (assumed): in every
+graph."""
 GROUP_SIZE = 16  # other effects in one graph: the number of lanes of a vector
 NOMINAL = ""  # stands for the twin without a further effect, in the first group
 INTEGRATOR_ORDER = 3
@@ -62,7 +63,7 @@ def assign_graphs(candidates: Candidates, runs: Sequence[MotionEffects]) -> dict
     One graph of all effects takes all runs together, those of groups cost less a run: the cheaper choice,
     counted in vectors of `GROUP_SIZE` runs.
     """
-    named = [{k for k, _ in run} - {*SOIL_KEYS} for run in runs]
+    named = [{k for k, _ in run} - {*SOIL_SIGMAS} for run in runs]
     if not any(named):
         return {(): list(range(len(runs)))}
     by_group: dict[tuple[str, ...], list[int]] = {}
@@ -134,7 +135,7 @@ def make_lanes(
         base = bases[id(log), id(model)]
         vehicle = base.vehicle.copy()
         vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
-        named = {*group, *SOIL_KEYS, *effects} & {*candidates.moving}
+        named = {*group, *SOIL_SIGMAS, *effects} & {*candidates.moving}
         present = {k: effects.get(k, 0.0) or ABSENT_SHARE * float(scales[k]) for k in sorted(named)}
         delay_s = input_delay_s(log, model, effects)
         if (id(log), delay_s) not in inputs:
@@ -211,7 +212,7 @@ class SampledSensors:
     def __init__(self, log: PreparedLog, model: Model, candidates: Candidates, samples: Indices) -> None:
         self.others, self.samples = frozenset(other_effects(model, candidates)), samples
         self.keys = frozenset(candidates.keys) | self.others
-        self.sensing = self.keys - {*candidates.moving} | {*SOIL_KEYS} & self.keys
+        self.sensing = self.keys - {*candidates.moving} | {*SOIL_SIGMAS} & self.keys
         self.mounting = mounting_vector(model.vehicle)
         route = route_of(log, model)
         self.fixed = route.is_fixed()
@@ -243,7 +244,7 @@ class SampledSensors:
     def _graph_effects(self, effects: Effects, group: Sequence[str]) -> tuple[str, ...]:
         """Effects of the smallest graph that has all of a run's."""
         present = {k for k, value in effects.items() if value != 0.0} & self.keys
-        for some in ({*group, *SOIL_KEYS} & self.keys | self.others, self.sensing):
+        for some in ({*group, *SOIL_SIGMAS} & self.keys | self.others, self.sensing):
             if present <= some:
                 return tuple(sorted(some))
         return tuple(sorted(self.keys))

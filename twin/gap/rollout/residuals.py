@@ -24,6 +24,7 @@ from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import aligned_start
 from terrafusion.twin.gap.data.samples import Indices, by_channel, sample_map, with_observed
+from terrafusion.twin.gap.rollout.batch import SOIL_SIGMAS
 from terrafusion.twin.gap.rollout.measured_turns import with_heading_errors
 from terrafusion.twin.gap.rollout.nuisance import nuisance_columns
 from terrafusion.twin.gap.rollout.sensitivities import (
@@ -38,8 +39,6 @@ from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise, with_shared
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 
-SOIL_SIGMAS = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
-"""Soil parameters that vary from run to run, with their first 1 sigma in typical sizes (assumed)."""
 OFFSET_SIGMAS = {"yaw_rate_radps": 0.001, "accel_x_mps2": 0.02, "accel_y_mps2": 0.02}
 """IMU channels with a turn-on offset, and its first 1 sigma (assumed)."""
 CURRENTS = ("current_left_a", "current_right_a")

@@ -15,8 +15,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.data.candidates import RANGE_SHARE, Candidates
 from terrafusion.twin.gap.data.threads import in_threads
+from terrafusion.twin.gap.rollout.batch import SOIL_SIGMAS
 from terrafusion.twin.gap.rollout.residuals import (
-    SOIL_SIGMAS,
     LinearisationCache,
     RunResiduals,
     WhitenedRun,

@@ -10,7 +10,8 @@ import pytest
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.infer.refit import RunWithEffects, whitened_errors
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
-from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, RunResiduals, WhitenedRun, clip_outliers
+from terrafusion.twin.gap.rollout.batch import SOIL_SIGMAS
+from terrafusion.twin.gap.rollout.residuals import RunResiduals, WhitenedRun, clip_outliers
 from terrafusion.twin.gap.rollout.run_soil import SoilSearch, soil_limit
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs
