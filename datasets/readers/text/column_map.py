@@ -15,7 +15,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.datasets.readers.channel_tables import COLUMNS, TRUTH_TWIST
+from terrafusion.datasets.readers.channel_tables import COLUMNS, GNSS_SIGMA, TRUTH_TWIST
 from terrafusion.datasets.readers.log_meta import DescriptionFile, Meta, parse_meta
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE
 
@@ -37,8 +37,14 @@ UNITS: dict[str, dict[str, float]] = {
 """Factor from each unit to that of the field, the first. g: standard gravity; mph, kn, ft: international."""
 
 
+VARIANCE = "m2"
+"""Unit of a sigma's column that holds its square."""
+
+
 def units_of(field: str) -> dict[str, float]:
     """The units that a column for `field` may be in, with their factors."""
+    if field in GNSS_SIGMA:
+        return UNITS["m"] | {VARIANCE: 1.0}
     ending = field.rpartition("_")[2]
     numeric = (field not in TRUTH_TWIST and field.startswith(("p_", "cov_"))) or "_" not in field
     return UNITS[""] if numeric or ending not in UNITS else UNITS[ending]

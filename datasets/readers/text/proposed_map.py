@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, YAW_RATE, units_of
+from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, VARIANCE, YAW_RATE, units_of
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
@@ -64,6 +64,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"alt|altitude|height|h", "gnss", ("height_m",)),
     (r"(?:fix_)?qual(?:ity)?|q|status_status", "gnss", ("fix",)),
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
+    *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
         (rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel)_?{a}", "imu", (f"gyro_{a}_radps",))
@@ -97,7 +98,7 @@ _LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
 """Names of a horizontal accuracy, which stands for the sigma of both axes."""
 _MESSAGE = re.compile(
     r"(?:.*_)?(angular_velocity_[xyz]|linear_acceleration_[xyz]|twist_(?:linear_x|angular_z)"
-    r"|latitude|longitude|altitude|status_status|header_stamp)"
+    r"|latitude|longitude|altitude|status_status|header_stamp|position_covariance_?[048])"
 )
 """Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
 _IN_G = (0.85, 1.15)
@@ -184,7 +185,7 @@ def _of_g(header: _Header) -> _Header:
 
 
 def _header(name: str) -> _Header:
-    bracketed = _BRACKETS.match(name)
+    bracketed = None if re.search(r"\[\d+\]$", name) else _BRACKETS.match(name)  # an element of an array
     base, unit = (bracketed[1], bracketed[2]) if bracketed else (name, "")
     base = re.sub(r"([a-z])([A-Z])", r"\1_\2", base.strip())
     base = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
@@ -228,7 +229,9 @@ def _entry(header: _Header, field: str) -> str:
     if field == "fix":
         codes = "navsatfix" if header.base.endswith("status") else "nmea"
         return f"{{column: {name}, unit: {codes}}}"
-    own = next(iter(units_of(field)))
+    own = VARIANCE if "covariance" in header.base else next(iter(units_of(field)))
+    if own == VARIANCE:
+        return f"{{column: {name}, unit: {VARIANCE}}}"
     if header.column == field or header.unit in ("", own):
         return name
     return f"{{column: {name}, unit: {header.unit}}}"

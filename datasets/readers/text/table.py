@@ -26,6 +26,7 @@ from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
     GEODETIC,
     TEXT_FIELDS,
+    VARIANCE,
     YAW_RATE,
     ColumnMap,
     MappedColumn,
@@ -203,6 +204,8 @@ def _table(
             factor = units_of(name).get(of.unit, 1.0) * (-of.scale if of.sign == "-" else of.scale)
             values = columns.numbers(of.column)[order]
             numbers[name] = values if factor == 1.0 else values * factor
+            if of.unit == VARIANCE:  # zero and below: the receiver knows none
+                numbers[name] = np.sqrt(np.where(numbers[name] <= 0.0, np.nan, numbers[name]))
     if "yaw_rad" in numbers:
         yaw = numbers.pop("yaw_rad")
         rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)

@@ -119,6 +119,16 @@ def test_exports_of_ros_messages_are_proposed(kind: str, tmp_path: Path) -> None
     assert recording.imu.gyro_radps[0, 2] == rate
 
 
+@pytest.mark.parametrize("end", ["0", "_0", "[0]"])
+def test_variances_of_fixes_are_proposed(end: str, tmp_path: Path) -> None:
+    names = [f"/fix/position_covariance{end.replace('0', i)}" for i in "048"]
+    text = f"t,/fix/latitude,/fix/longitude,{','.join(names)}\n0,48.1,11.5,0.25,0.25,4\n1,48.1,11.5,-1,0,4\n"
+    gnss = opened_as_proposed(tmp_path, text).gnss
+    assert gnss is not None
+    np.testing.assert_allclose(gnss.sigma_enu_m[0], [0.5, 0.5, 2.0])
+    assert (gnss.sigma_enu_m[1] >= 0.5).all()  # nothing is known of it
+
+
 @pytest.mark.parametrize(
     "names",
     ["t,v,w", "t,field.twist.twist.linear.x,field.twist.twist.angular.z", "t,speed_mps,yaw_rate_radps"],
