@@ -58,6 +58,8 @@ COMMANDS = "reset, on, off, or datum LATITUDE LONGITUDE HEIGHT"
 LOOK_S = 1.0
 """Messages of this long show which sensors there are."""
 DIAGNOSTICS_S = 1.0
+SILENT_S = 2.0
+"""Without a sample of the IMU for longer the diagnostics warn (assumed)."""
 MISSING_NS = 5_000_000_000
 """Messages are held for so long while a sensor is missing."""
 MOST_REPORTED = 200
@@ -385,6 +387,9 @@ class LiveNode:
         if status != self._status[0]:
             self._say(f"{status}: {STATUS[status]}")
             self._status = status, self._now_s
+        silent_s = self._ordered.silent_s(self._now_s)
+        if self.estimator is not None and self.running and silent_s > SILENT_S:
+            self._report(f"no sample of the IMU for {silent_s:.0f} s: nothing is estimated")
         newest = None if self.estimator is None else self.estimator.latest()
         t_ns = self._clock_ns or (newest.t_ns if newest else 0) or time.time_ns()
         lasted_s = self._now_s - self._status[1]
