@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.frames import NEAREST_TO_POLE_DEG
@@ -43,7 +45,7 @@ from terrafusion.fusion.inputs.time_jumps import (
     Newest,
     TimeJump,
 )
-from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M
+from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M, as_numbers
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.loop import live_estimator
 from terrafusion.fusion.live.ordered import OrderedSamples
@@ -55,6 +57,7 @@ from terrafusion.twin.model.vehicle import load_vehicle
 CLOCK = ("/clock", "rosgraph_msgs/msg/Clock")
 COMMAND = ("/terrafusion/command", "std_msgs/msg/String")
 COMMANDS = "reset, on, off, or datum LATITUDE LONGITUDE HEIGHT"
+DATUM = "give latitude and longitude in degrees and the height in metres"
 LOOK_S = 1.0
 """Messages of this long show which sensors there are."""
 DIAGNOSTICS_S = 1.0
@@ -105,6 +108,8 @@ class LiveOptions:
         if not 0.0 <= self.wait_s <= 0.5:
             raise ConfigError(f"wait is {self.wait_s} s", remedy="give 0 to 0.5 s")
         if self.datum is not None:
+            if np.shape(self.datum) != (3,):
+                raise ConfigError(f"the datum {self.datum!r} has not three numbers", remedy=DATUM)
             checked_datum(*self.datum)
 
 
@@ -202,7 +207,7 @@ class LiveNode:
         """Move the origin of `map`, deg and m, and begin anew.
 
         Raises:
-            ConfigError: it is not on Earth.
+            ConfigError, DataError: it is not on Earth, or no numbers.
         """
         datum = checked_datum(latitude, longitude, height_m)
         self.options = dataclasses.replace(self.options, datum=datum)
@@ -414,7 +419,9 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
 
     Raises:
         ConfigError: it is not on Earth, or on a pole, where no direction is east.
+        DataError: it is no numbers.
     """
+    latitude, longitude, height_m = as_numbers((latitude, longitude, height_m), "the datum", "datum").tolist()
     if not (
         abs(latitude) <= 90.0 - NEAREST_TO_POLE_DEG
         and abs(longitude) <= 180.0
@@ -422,7 +429,7 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
     ):
         raise ConfigError(
             f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole, or not on Earth",
-            remedy="give latitude and longitude in degrees and the height in metres",
+            remedy=DATUM,
         )
     return latitude, longitude, height_m
 

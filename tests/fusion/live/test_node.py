@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Imu, Wheels
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers import ros_messages as ros
@@ -272,12 +272,18 @@ def test_a_node_does_not_listen_to_itself() -> None:
         {"wait_s": 2.0},
         {"datum": (91.0, 0.0, 0.0)},
         {"datum": (-90.0, 0.0, 0.0)},
+        {"datum": (47.0, 8.0)},
         {"vehicle": "no such"},
     ],
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         Run(**options)
+
+
+def test_a_datum_that_is_no_number_is_refused() -> None:
+    with pytest.raises(DataError, match="no numbers"):
+        Run().node.set_datum("a", 8.0, 400.0)  # type: ignore[arg-type]
 
 
 def test_two_imus_are_a_question_and_no_end(messages: list[BagMessage]) -> None:
