@@ -41,6 +41,7 @@ from terrafusion.fusion.inputs.time_jumps import (
     CONFIRMED,
     CONFIRMED_NS,
     JUMP_NS,
+    ClockJumpError,
     EarlyFixes,
     Newest,
     TimeJump,
@@ -351,6 +352,9 @@ class LiveNode:
             message = sensors.arriving.with_velocity(sample) if isinstance(sample, Gnss) else sample
             try:
                 estimator.add(message)
+            except ClockJumpError as error:
+                self.reset(error.what)
+                return
             except TerrafusionError as error:
                 self._refuse(type(message).__name__, error)
             except (ArithmeticError, ValueError, RuntimeError) as error:  # a defect must not end the node

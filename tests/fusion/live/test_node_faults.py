@@ -68,6 +68,23 @@ def test_stamps_that_leap_without_a_pause_start_the_estimator_anew(messages: lis
     assert times[-1] - times[0] > 3600 * 10**9, "the new clock is used"
 
 
+def test_stamps_that_leave_those_of_the_fixes_start_the_estimator_anew(messages: list[BagMessage]) -> None:
+    """All are behind the time of receipt: the fixes, once a second, show that no pause is passing."""
+    run, begin, late_ns, fixes = Run(frequency=1.0), messages[0][0] + 4 * 10**9, 10**12, 0
+    for jumps in (False, True):
+        some = []
+        for message in messages[: 4 * len(messages) // 5]:
+            t, topic, msgtype, cdr = message
+            fixes += topic == "/fix"
+            if (t >= begin) is jumps and topic != "/fix_velocity" and (topic != "/fix" or fixes % 5 == 0):
+                cdr = ahead(message, 100)[-1] if jumps and topic != "/fix" else cdr
+                some.append((t + late_ns, topic, msgtype, cdr))
+        run.feed(some, close=False)
+    (line,) = [line for line in run.said if "started anew" in line]
+    assert line.endswith("is 100.0 s ahead of the fixes, which go on as before")
+    assert run.node.counts["refused"] == 0
+
+
 def test_stamps_that_leap_for_a_moment_are_refused(messages: list[BagMessage], replayed: Estimate) -> None:
     few = [ahead(m, 3600) if i % 500 in (50, 51, 52) else m for i, m in enumerate(messages)]
     run = Run().feed(few)
