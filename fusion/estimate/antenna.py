@@ -36,10 +36,9 @@ class AntennaPlaces:
         if n >= MOST:
             gaps_ns = [self.since_ns[i + 1] - self.since_ns[i - 1] for i in held[1:-1]]
             del held[1 + gaps_ns.index(min(gaps_ns))]
-        since_ns, levers_m, lates_ns = (
-            [column[i] for i in held] for column in (self.since_ns, self.lever_m, self.late_ns)
-        )
-        return AntennaPlaces((*since_ns, t_ns), (*levers_m, lever_m), (*lates_ns, late_ns))
+        since_ns = *(self.since_ns[i] for i in held), t_ns
+        levers_m = *(self.lever_m[i] for i in held), lever_m
+        return AntennaPlaces(since_ns, levers_m, (*(self.late_ns[i] for i in held), late_ns))
 
     def at(self, t_ns: TimesNs) -> Array:
         """Lever arms (N, 3) at the times (N,)."""

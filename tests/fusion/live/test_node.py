@@ -247,6 +247,28 @@ def test_wheels_of_every_type_carry_the_robot(
     assert error_m(run.history, live_recording) < 1.0
 
 
+def one_joint(t: int, name: str, angle: float) -> bytes:
+    layout = CdrTemplate().header("").strings([name]).constant("I", 1).constant("d", angle)
+    return split(layout.constant("I", 0, 0).stamped(np.array([t])))[0]
+
+
+def test_joints_in_topics_of_their_own_whose_counters_roll_over_carry_the_robot(
+    messages: list[BagMessage], live_recording: Recording
+) -> None:
+    wheels, kind, period = live_recording.wheels, "sensor_msgs/msg/JointState", 6.0 * np.pi
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    found = [one for one in messages if one[1] != "/joint_states" and not one[2].endswith("/Odometry")]
+    for t_ns, angles in zip(wheels.t_ns.tolist(), wheels.angle_rad % period, strict=True):
+        for name, angle in zip(wheels.names, angles.tolist(), strict=True):
+            found.append((t_ns, f"/{name}/joint_states", kind, one_joint(t_ns, "joint", angle)))
+    run = Run(frequency=2.0).feed(sorted(found, key=lambda one: one[0]))
+    assert run.node.counts["refused"] == 0, run.said
+    assert run.node.estimator is not None
+    assert (run.node.estimator.wheels.jumps, run.node.estimator.wheels.impossible) == (0, 0)
+    assert error_m(run.history, live_recording) < 0.1
+
+
 def test_time_is_that_of_the_simulator(messages: list[BagMessage]) -> None:
     run = Run(use_sim_time=True)
     assert run.node.wants("/clock", "rosgraph_msgs/msg/Clock")
