@@ -101,25 +101,38 @@ def speeds_of(t_ns: TimesNs, angle_rad: Array) -> tuple[Mask, Array]:
     return np.concatenate([[False], later]), speed
 
 
+FASTEST_RADPS = 100.0
+"""A counter that steps back faster than this rolls over: no wheel of a ground robot turns so (assumed)."""
+
+
 class TurnCounter:
     """Unwraps angles that come one after another, as `unwrapped` does of a log where steps are small."""
 
     def __init__(self) -> None:
         self._last: Array | None = None
-        self._least = self._most = self._turns = np.zeros(0)
+        self._last_ns = 0
+        self._least = self._most = self._turns = self._rolled = self._way = np.zeros(0)
 
-    def counted(self, angle_rad: Array) -> Array:
-        """The angles (wheels,) with the whole turns since the first; the same array where there are none."""
+    def counted(self, angle_rad: Array, t_ns: int) -> Array:
+        """The angles (wheels,) at `t_ns` as turned since the first; the same array where nothing was lost."""
+        before_ns, self._last_ns = self._last_ns, t_ns
         if self._last is None or self._last.shape != angle_rad.shape or not np.isfinite(angle_rad).all():
             self._last = self._least = self._most = angle_rad
-            self._turns = np.zeros_like(angle_rad)
+            self._turns = self._rolled = self._way = np.zeros_like(angle_rad)
             return angle_rad
         self._least = np.minimum(self._least, angle_rad)
         self._most = np.maximum(self._most, angle_rad)
         step, self._last = angle_rad - self._last, angle_rad
-        jumps = (np.abs(step) > NEARLY * TURN_RAD) & (self._most - self._least <= WITHIN * TURN_RAD)
+        far, range_rad = np.abs(step), self._most - self._least
+        jumps = (far > NEARLY * TURN_RAD) & (range_rad <= WITHIN * TURN_RAD)
         self._turns = self._turns + np.where(jumps, np.rint(step / TURN_RAD), 0.0)
-        return angle_rad - TURN_RAD * self._turns if self._turns.any() else angle_rad
+        back = (step * self._way < 0.0) & (far * 1e9 > FASTEST_RADPS * (t_ns - before_ns))
+        rolls = back & ~jumps & (range_rad > WITHIN * TURN_RAD) & (far > NEARLY * range_rad)
+        self._rolled = self._rolled + np.where(rolls, step - self._way, 0.0)
+        self._way = np.where(jumps | rolls | (step == 0.0), self._way, step)
+        if not (self._turns.any() or self._rolled.any()):
+            return angle_rad
+        return angle_rad - TURN_RAD * self._turns - self._rolled
 
 
 LEAST_SAMPLES, MOST_WHOLE = 10, 0.1

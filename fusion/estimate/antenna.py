@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs
 
+MOST = 1000
+"""Places that are held: over an hour of learning. Of more, those that lasted shortest are dropped."""
+
 
 @dataclass(frozen=True)
 class AntennaPlaces:
@@ -29,9 +32,13 @@ class AntennaPlaces:
         if lever_m == self.lever_m[-1] and late_ns == self.late_ns[-1]:
             return self
         n = bisect.bisect_left(self.since_ns, t_ns)
-        return AntennaPlaces(
-            (*self.since_ns[:n], t_ns), (*self.lever_m[:n], lever_m), (*self.late_ns[:n], late_ns)
-        )
+        held = list(range(n))
+        if n >= MOST:
+            gaps_ns = [self.since_ns[i + 1] - self.since_ns[i - 1] for i in held[1:-1]]
+            del held[1 + gaps_ns.index(min(gaps_ns))]
+        since_ns = *(self.since_ns[i] for i in held), t_ns
+        levers_m = *(self.lever_m[i] for i in held), lever_m
+        return AntennaPlaces(since_ns, levers_m, (*(self.late_ns[i] for i in held), late_ns))
 
     def at(self, t_ns: TimesNs) -> Array:
         """Lever arms (N, 3) at the times (N,)."""

@@ -53,8 +53,7 @@ class AidingSensors:
 
     def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> KnownStart | None:
         """Position and heading of a robot at rest, once there are a fix and a field."""
-        self.height.forget(imu.t_ns[0])
-        self.heading.forget(imu.t_ns[0])
+        self.forget(imu.t_ns[0])
         early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
         if not early or not self.heading.ready:
             return None
@@ -67,6 +66,11 @@ class AidingSensors:
         best = min(early, key=lambda fix: float(fix.sigma_m[0]))
         position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
         return KnownStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a time."""
+        self.height.forget(before_ns)
+        self.heading.forget(before_ns)
 
     def notes(self) -> tuple[str, ...]:
         """What was made of the samples, in sentences."""

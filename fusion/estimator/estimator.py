@@ -57,7 +57,7 @@ from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import level_factor, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.steering import SteeringStream
-from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, usual_interval_s
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, forget_in_pause, usual_interval_s
 from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
 from terrafusion.fusion.inputs.validation import as_number, as_numbers, checked_fix
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -176,6 +176,7 @@ class Estimator:
     ) -> None:
         """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
         self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
+        forget_in_pause(self.imu, self.wheels, self.steering, self.aids, self.gnss)
         if self.config.inputs.imu == "none":  # the wheels are the clock, and their difference the yaw rate
             steering = self.steering if self.config.inputs.yaw == "steering" else None
             self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m, steering), UNKNOWN)

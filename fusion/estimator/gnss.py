@@ -126,6 +126,12 @@ class GnssUpdater:
         self.waiting = [fix for fix in self.waiting if id(fix) in kept]
         self.rejected += before - len(self.waiting)
 
+    def forget(self, before_ns: int) -> None:
+        """Drop waiting fixes from before a time: no keyframe will hold them."""
+        held = [fix for fix in self.waiting if fix.t_ns >= before_ns]
+        self.too_late += len(self.waiting) - len(held)
+        self.waiting = held
+
     def have_new(self) -> bool:
         """Whether fixes came since the last call."""
         changed = len(self.waiting) != self._seen

@@ -29,10 +29,11 @@ def _on_fixes(gnss: GnssUpdater) -> list[str]:
             f"the first fixes ended before they showed the heading clearly: it was open at first; {then}"
         )
     elif gnss.local and not gnss.unaligned:
-        notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
+        notes.append("no GNSS fix came in time: the path is local, its start and heading are arbitrary")
     elif gnss.local:
+        fixes = counted(gnss.unaligned, "GNSS fix", "GNSS fixes")
         notes.append(
-            f"{gnss.unaligned} GNSS fixes came after a start without any and did not show the heading: "
+            f"{fixes} came after a start without any and did not show the heading: "
             "the path is local, its start and heading are arbitrary"
         )
     if gnss.too_late:

@@ -22,6 +22,7 @@ from terrafusion.fusion.estimator.plausibility import plausible_fixes
 from terrafusion.fusion.estimator.stationarity import drop_before_start
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.time_jumps import JUMP_NS
 
 SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
 """Without a fix for so long the start no longer waits for a better heading, where there is one that tells
@@ -70,7 +71,8 @@ class StartSearch:
         if self.known is not None:
             return self.known.at(self.level)
         now_ns = imu.t_ns[-1]
-        if not self._gnss.waiting:
+        # Fixes of another time, as of a receiver whose clock is wrong, are as none: they show no motion.
+        if not any(begin <= fix.t_ns <= now_ns + JUMP_NS for fix in self._gnss.waiting):
             if not last and (now_ns - begin) * 1e-9 <= self._config.longest_wait_s:
                 return None
             self._gnss.local = True
@@ -79,7 +81,10 @@ class StartSearch:
             self._newest_fix_came_ns = now_ns
             return self._by_motion(imu, wheels, steering, self.level)
         if last or now_ns - self._newest_fix_came_ns > SILENT_NS:
-            return self._by_rough_heading(wheels, self.level)
+            start = self._by_rough_heading(wheels, self.level)
+            if start is None:
+                self._drop_unusable(imu, wheels)
+            return start
         return None
 
     def _by_motion(
@@ -93,9 +98,12 @@ class StartSearch:
             self._gnss.refuse_waiting(fitting)
             return found.start
         self._rough = found
+        self._drop_unusable(imu, wheels)
+        return None
+
+    def _drop_unusable(self, imu: ImuStream, wheels: WheelStream) -> None:
         if drop_before_start(imu, wheels, self._gnss.waiting):
             self.level = self._rough = None
-        return None
 
     def _by_rough_heading(self, wheels: WheelStream, level: Start) -> Start | None:
         """The start by the heading that there is, where no more fixes come."""

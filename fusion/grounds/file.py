@@ -12,7 +12,7 @@ from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import dump_yaml, read_yaml
-from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Ground, Tally
+from terrafusion.fusion.grounds.ground import FRICTION_MODELS, MOST_SLIP, Ground, Tally
 from terrafusion.fusion.grounds.memory import MOST_GROUNDS, GroundMemory
 from terrafusion.fusion.grounds.signature import SIGNATURE
 
@@ -57,8 +57,8 @@ def load_grounds(path: Path) -> GroundMemory:
     """The memory in a file.
 
     Raises:
-        ConfigError: unknown or missing key, wrong type, out of range, an unknown number of a signature, more
-            than `MOST_GROUNDS` grounds or two of one name.
+        ConfigError: unknown or missing key, wrong type, out of range, an unknown number of a signature, slip
+            that is no share, more than `MOST_GROUNDS` grounds or two of one name.
     """
     content = structure(GroundsFile, read_yaml(path), file=path)
     names = [ground.name for ground in content.grounds]
@@ -77,6 +77,13 @@ def load_grounds(path: Path) -> GroundMemory:
                 file=path,
                 remedy=f"'signature' may hold {', '.join(SIGNATURE)}; 'friction' holds {FRICTION_MODELS}",
             )
+        for name, tally in (("slip", ground.slip), ("side_slip", ground.side_slip)):
+            if abs(tally.mean) > MOST_SLIP:
+                raise ConfigError(
+                    f"ground '{ground.name}': '{name}' has mean {tally.mean:g}",
+                    file=path,
+                    remedy="give a share, -1 to 1, not per cent",
+                )
     return GroundMemory([_ground(g) for g in content.grounds], content.robot)
 
 

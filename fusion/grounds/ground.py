@@ -24,6 +24,8 @@ FRICTION_MODELS = 10
 """Friction limits of the bank and, last, rolling (`estimator.friction`)."""
 SLIPPERY_MODELS = 6
 """The first ones: limits of ice, wet and snowy ground."""
+MOST_SLIP = 1.0
+"""Largest slip or side-slip of a stretch that is learned."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.grounds.ground import SLIPPERY_MODELS
+from terrafusion.fusion.grounds.ground import MOST_SLIP, SLIPPERY_MODELS
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.grounds.signature import SignatureExtractor
 from terrafusion.fusion.terrain.features import Window
@@ -30,7 +30,6 @@ CLOCKED_NS = 946_684_800_000_000_000
 """Stamps before the year 2000 are no dates."""
 LEAST_M, SIGMAS, MOST_M, MOST_S = 4.0, 20.0, 40.0, 60.0
 """A stretch ends after 4 m and twenty sigma of the position, at most 40 m; one of 60 s is dropped."""
-MOST_SLIP = 1.0
 
 
 class FrictionBank(Protocol):

@@ -161,7 +161,9 @@ class GroundMemory:
         return GroundMemory(list(found.values()), self.robot)
 
     def condensed(self) -> "GroundMemory":
-        """With grounds merged that look alike, and those left out of which too little was seen."""
+        """With grounds merged that look alike; without those of which too little was seen, or of which too
+        many others were seen longer.
+        """
         kept: list[Ground] = []
         for ground in sorted(self.grounds, key=lambda g: -g.windows):
             if ground.windows < LEAST_WINDOWS:
@@ -171,7 +173,7 @@ class GroundMemory:
                 kept.append(ground)
             else:
                 kept[twin] = kept[twin].merged(ground)
-        return GroundMemory(kept, self.robot)
+        return GroundMemory(kept[:MOST_GROUNDS], self.robot)
 
 
 def merged(memories: Iterable[GroundMemory]) -> GroundMemory:

@@ -4,6 +4,7 @@ import bisect
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,6 +60,8 @@ REPLACED_BY = 10
 """Number of samples before a spike whose mean replaces it: fewer would contain too much vibration."""
 LONGEST_PAUSE_NS = 20_000_000_000
 """A longer pause of the IMU has no keyframes: what a call computes is bounded."""
+BEFORE_PAUSE_NS = 5_000_000_000
+"""What is held beyond that while the IMU is silent: its samples may come so late."""
 USUAL_GAP_S = 0.5
 """Time between samples up to which a stream of any rate has no gap (assumed: lost messages of a 10 Hz
 sensor)."""
@@ -402,3 +405,21 @@ class WheelStream(SampleStream):
             return 0.0
         change = 0.5e9 * (sum(last) / (d - c) - sum(first) / (b - a))
         return change * (end_ns - start_ns) / (0.5 * (c + d - a - b))
+
+
+class Forgetful(Protocol):
+    """Holds samples of which those before a time can be dropped."""
+
+    def forget(self, before_ns: int) -> None: ...
+
+
+def forget_in_pause(imu: ImuStream, wheels: WheelStream, *others: Forgetful) -> None:
+    """Drop what keyframes cannot use while the IMU is silent: the next one comes after the pause."""
+    before_ns = wheels.t_ns[-1] - LONGEST_PAUSE_NS - BEFORE_PAUSE_NS if wheels.t_ns else 0
+    if imu.t_ns and imu.t_ns[-1] >= before_ns:
+        return
+    held = len(wheels.t_ns)
+    wheels.forget(before_ns)
+    if len(wheels.t_ns) < held:
+        for samples in others:
+            samples.forget(before_ns)

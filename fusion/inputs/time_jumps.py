@@ -28,6 +28,10 @@ LONGEST_REFUTED_NS = 5_000_000_000
 """A clock that has gone ahead of the fixes for so long does not return (assumed)."""
 
 
+class ClockJumpError(DataError):
+    """IMU or wheels have been ahead of all others for so long that they will not return."""
+
+
 def median_step_ns(times: Iterable[int]) -> int:
     """Median of the steps between times, ns, the upper one of two; 0 with fewer than three times."""
     steps = [b - a for a, b in itertools.pairwise(times)]
@@ -120,7 +124,7 @@ class TimeJump:
         """The samples to use now: this one, none while it is far ahead, or all held once they agree.
 
         Raises:
-            DataError: for seconds they have been ahead of fixes that go on as before.
+            ClockJumpError: for seconds they have been ahead of fixes that go on as before.
         """
         t_ns, before, newest = sample[0], [], self.newest
         if not self.held and newest.t_ns is not None and t_ns - newest.t_ns <= JUMP_NS:  # as most are
@@ -177,7 +181,7 @@ class TimeJump:
         elif self.refuted_ns is not None and t_ns - self.refuted_ns > LONGEST_REFUTED_NS:
             self.dropped += 1
             ahead_s = (t_ns - self.newest.fixes_ns[-1]) * 1e-9
-            raise DataError(
+            raise ClockJumpError(
                 f"sample at {t_ns} ns is {ahead_s:.1f} s ahead of the fixes, which go on as before",
                 channel=self.channel,
                 remedy="start anew where the clock of IMU and wheels jumps",

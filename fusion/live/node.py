@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.frames import NEAREST_TO_POLE_DEG
@@ -39,11 +41,12 @@ from terrafusion.fusion.inputs.time_jumps import (
     CONFIRMED,
     CONFIRMED_NS,
     JUMP_NS,
+    ClockJumpError,
     EarlyFixes,
     Newest,
     TimeJump,
 )
-from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M
+from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M, as_numbers
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.loop import live_estimator
 from terrafusion.fusion.live.ordered import OrderedSamples
@@ -55,9 +58,12 @@ from terrafusion.twin.model.vehicle import load_vehicle
 CLOCK = ("/clock", "rosgraph_msgs/msg/Clock")
 COMMAND = ("/terrafusion/command", "std_msgs/msg/String")
 COMMANDS = "reset, on, off, or datum LATITUDE LONGITUDE HEIGHT"
+DATUM = "give latitude and longitude in degrees and the height in metres"
 LOOK_S = 1.0
 """Messages of this long show which sensors there are."""
 DIAGNOSTICS_S = 1.0
+SILENT_S = 2.0
+"""Without a sample of the IMU for longer the diagnostics warn (assumed)."""
 MISSING_NS = 5_000_000_000
 """Messages are held for so long while a sensor is missing."""
 MOST_REPORTED = 200
@@ -103,6 +109,8 @@ class LiveOptions:
         if not 0.0 <= self.wait_s <= 0.5:
             raise ConfigError(f"wait is {self.wait_s} s", remedy="give 0 to 0.5 s")
         if self.datum is not None:
+            if np.shape(self.datum) != (3,):
+                raise ConfigError(f"the datum {self.datum!r} has not three numbers", remedy=DATUM)
             checked_datum(*self.datum)
 
 
@@ -200,7 +208,7 @@ class LiveNode:
         """Move the origin of `map`, deg and m, and begin anew.
 
         Raises:
-            ConfigError: it is not on Earth.
+            ConfigError, DataError: it is not on Earth, or no numbers.
         """
         datum = checked_datum(latitude, longitude, height_m)
         self.options = dataclasses.replace(self.options, datum=datum)
@@ -344,6 +352,9 @@ class LiveNode:
             message = sensors.arriving.with_velocity(sample) if isinstance(sample, Gnss) else sample
             try:
                 estimator.add(message)
+            except ClockJumpError as error:
+                self.reset(error.what)
+                return
             except TerrafusionError as error:
                 self._refuse(type(message).__name__, error)
             except (ArithmeticError, ValueError, RuntimeError) as error:  # a defect must not end the node
@@ -385,6 +396,9 @@ class LiveNode:
         if status != self._status[0]:
             self._say(f"{status}: {STATUS[status]}")
             self._status = status, self._now_s
+        silent_s = self._ordered.silent_s(self._now_s)
+        if self.estimator is not None and self.running and silent_s > SILENT_S:
+            self._report(f"no sample of the IMU for {silent_s:.0f} s: nothing is estimated")
         newest = None if self.estimator is None else self.estimator.latest()
         t_ns = self._clock_ns or (newest.t_ns if newest else 0) or time.time_ns()
         lasted_s = self._now_s - self._status[1]
@@ -409,7 +423,9 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
 
     Raises:
         ConfigError: it is not on Earth, or on a pole, where no direction is east.
+        DataError: it is no numbers.
     """
+    latitude, longitude, height_m = as_numbers((latitude, longitude, height_m), "the datum", "datum").tolist()
     if not (
         abs(latitude) <= 90.0 - NEAREST_TO_POLE_DEG
         and abs(longitude) <= 180.0
@@ -417,7 +433,7 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
     ):
         raise ConfigError(
             f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole, or not on Earth",
-            remedy="give latitude and longitude in degrees and the height in metres",
+            remedy=DATUM,
         )
     return latitude, longitude, height_m
 

@@ -32,7 +32,7 @@ class OrderedSamples:
         self._heap: list[tuple[int, int, int, Any]] = []
         self._number = 0
         self.newest_ns: int | None = None
-        self._moved: tuple[int | None, float] = None, 0.0
+        self._moved: tuple[int | None, float] | None = None
 
     def add(self, t_ns: int, channel: str, sample: Any) -> None:
         """Take a sample of a channel."""
@@ -41,11 +41,15 @@ class OrderedSamples:
         if channel == "imu":
             self.newest_ns = t_ns if self.newest_ns is None else max(self.newest_ns, t_ns)
 
+    def silent_s(self, now_s: float) -> float:
+        """How long the IMU had sent nothing newer when `released` was last called, at `now_s`, s."""
+        return 0.0 if self._moved is None else now_s - self._moved[1]
+
     def released(self, now_s: float) -> Iterator[Any]:
         """The samples that wait no longer, at `now_s` by the wall clock."""
-        if self._moved[0] != self.newest_ns:
+        if self._moved is None or self._moved[0] != self.newest_ns:
             self._moved = self.newest_ns, now_s
-        stopped = now_s - self._moved[1] > LONGEST_WAIT_S
+        stopped = self.silent_s(now_s) > LONGEST_WAIT_S
         while self._heap and (stopped or self._is_covered()):
             yield heapq.heappop(self._heap)[-1]
 

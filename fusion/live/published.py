@@ -104,6 +104,7 @@ def diagnostics(
         counts = {
             **counts,
             "rejected_gnss": estimator.gnss.rejected,
+            "untimely_gnss": estimator.gnss.too_late + estimator.newest.refused.get("gnss", 0),
             "rejected_wheels": estimator.wheels_rejected,
         }
     else:

@@ -4,9 +4,8 @@ Both ways go through the decoder and the `ChannelBuilder` of bags: a message giv
 from a bag.
 """
 
-import dataclasses
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,9 @@ from terrafusion.datasets.core.messages import Message, WheelSample
 from terrafusion.datasets.core.wrapped_angles import TurnCounter
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics
+from terrafusion.datasets.readers.ros.arriving_joints import ArrivingJoints
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
-from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
+from terrafusion.datasets.readers.ros.joints import joined, joint_names, steering_joints
 from terrafusion.datasets.readers.ros.layout import Fields, MessageDecoder
 from terrafusion.datasets.readers.ros.raw import BagSource, Groups, MessageBatch, batches_of
 from terrafusion.datasets.readers.ros.streams import Stream, broken_bag_on_error, types_of, wanted_fields
@@ -56,15 +56,15 @@ class RawMessage:
         """The fields of this message as a stream of one; a BagError where it does not fit its definition."""
         with broken_bag_on_error(self.topic):
             decoder = MessageDecoder(self.msgtype, live_types(self.msgtype), fields, True, self.topic)
-            return _decoded(decoder, [self])
+            return _decoded(decoder, self)
 
 
-def _decoded(decoder: MessageDecoder, messages: Sequence[RawMessage]) -> Stream:
-    """Messages of one topic, by a decoder that may know their layout already."""
-    for batch in batches_of([(0, message.receipt_ns, message.cdr) for message in messages], [[0]]):
+def _decoded(decoder: MessageDecoder, message: RawMessage) -> Stream:
+    """A message, by a decoder that may know its layout already."""
+    for batch in batches_of([(0, message.receipt_ns, message.cdr)], [[0]]):
         decoder.add(batch)
     receipt_ns, blocks = decoder.result()
-    return Stream(messages[0].topic, messages[0].msgtype, receipt_ns, blocks)
+    return Stream(message.topic, message.msgtype, receipt_ns, blocks)
 
 
 class GatheredMessages:
@@ -118,9 +118,11 @@ class ArrivingMessages:
     notes: list[str] = field(default_factory=list)
     _decoders: dict[str, MessageDecoder] = field(default_factory=dict)
     _velocities: deque[tuple[int, Stream]] = field(default_factory=lambda: deque(maxlen=50))
-    _before: RawMessage | None = None
     _turns: TurnCounter = field(default_factory=TurnCounter)
     _header_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self._joints = ArrivingJoints(joints_given(self.request.topics))
 
     def samples(self, message: RawMessage) -> list[tuple[int, str, Any]]:
         """Time, channel and sample of what the message gives; a fix waits for `with_velocity`.
@@ -130,10 +132,10 @@ class ArrivingMessages:
         """
         found: list[tuple[int, str, Any]] = []
         for kind, topic in self.chosen.items():
-            if (topic.name, topic.msgtype) == (message.topic, message.msgtype):
+            if message.topic in topic.names and topic.msgtype == message.msgtype:
                 stream = self._stream(kind, message)
                 with errors_of(LIVE), broken_bag_on_error(message.topic):
-                    for sample in self._samples(kind, stream, self._time_of(stream), message):
+                    for sample in self._samples(kind, stream, self._time_of(stream)):
                         t_ns = sample.t_ns[0] if isinstance(sample, Gnss) else sample.t_ns
                         found.append((int(t_ns), kind, sample))
         return found
@@ -157,9 +159,7 @@ class ArrivingMessages:
             gnss = self._builder().gnss_velocity(gnss, near[1], np.array([near[0]]))
         return next(iter(gnss.samples()))
 
-    def _samples(
-        self, kind: str, stream: Stream, t_ns: NDArray[np.int64], message: RawMessage
-    ) -> Iterator[Any]:
+    def _samples(self, kind: str, stream: Stream, t_ns: NDArray[np.int64]) -> Iterator[Any]:
         builder = self._builder()
         if kind == "gnss":
             gnss, datum = builder.gnss(stream, t_ns, self.datum)
@@ -171,7 +171,7 @@ class ArrivingMessages:
         elif kind == "datum":
             self.datum = self.datum or builder.datum(stream)
         elif kind == "wheels":
-            yield from self._wheels(stream, t_ns, message)
+            yield from self._wheels(stream, t_ns)
         elif stream.msgtype == topics.JOINTS and not steering_joints(joint_names(stream)):
             return  # of other joints
         else:
@@ -182,43 +182,38 @@ class ArrivingMessages:
                     sample = type(sample)(sample.t_ns, *turned_by(self.imu_turn, both))
                 yield sample
 
-    def _wheels(self, stream: Stream, t_ns: NDArray[np.int64], message: RawMessage) -> Iterator[Message]:
-        """The newest wheel speeds; joints without velocities need the message before."""
-        wheels = None
-        if stream.msgtype != topics.JOINTS:
-            wheels, _ = self._builder().wheels(stream, t_ns, None)
-        elif wheel_joints(joint_names(stream), joints_given(self.request.topics)):  # else of other joints
-            before, self._before = self._before, message
-            moved = stream.blocks[0].columns["velocity"].shape[1] > 0
-            if not moved and before is None:
+    def _wheels(self, stream: Stream, t_ns: NDArray[np.int64]) -> Iterator[Message]:
+        """Wheel speeds, of joints with whole turns; see `ArrivingJoints`."""
+        if stream.msgtype == topics.JOINTS:
+            if self.chosen["wheels"].beside:
+                stream = joined([stream])
+            if not self._joints.are_whole(stream):
+                yield from self._joints.samples(stream, int(t_ns[0]))
                 return
-            if not moved and before is not None:
-                stream = self._stream("wheels", before, message)
-                t_ns = np.concatenate([self._time_of(stream.select(np.array([i]))) for i in range(2)])
-            wheels, _ = self._builder().wheels(stream, t_ns, None)
+        wheels, _ = self._builder().wheels(stream, t_ns, None)
         for sample in [] if wheels is None else list(wheels.samples())[-1:]:
             assert isinstance(sample, WheelSample)
             angle = sample.angle_rad
-            if angle is not None and len(stream) > 1:  # as it came: its turns are counted below
-                builder = dataclasses.replace(self._builder(), as_written=True)
-                raw, _ = builder.wheels(stream, t_ns, None)
-                angle = None if raw is None or raw.angle_rad is None else raw.angle_rad[-1]
-            yield sample if angle is None else sample._replace(angle_rad=self._turns.counted(angle))
+            yield (
+                sample
+                if angle is None
+                else sample._replace(angle_rad=self._turns.counted(angle, sample.t_ns))
+            )
 
     def _is_nowhere(self, stream: Stream) -> bool:
         """Latitude and longitude 0, which receivers report that know none, unless the datum is there."""
         at_zero = not stream.column("latitude")[0] and not stream.column("longitude")[0]
         return at_zero and (self.datum is None or max(map(abs, self.datum[:2])) > 0.1)
 
-    def _stream(self, kind: str, *messages: RawMessage) -> Stream:
-        """The messages of one topic, by a decoder that knows their layout already."""
-        topic, msgtype = messages[0].topic, messages[0].msgtype
+    def _stream(self, kind: str, message: RawMessage) -> Stream:
+        """A message, by a decoder that knows its layout already."""
+        topic, msgtype = message.topic, message.msgtype
         decoder = self._decoders.pop(kind, None)
         with broken_bag_on_error(topic):
             if decoder is None:
                 fields = wanted_fields(kind, msgtype)
                 decoder = MessageDecoder(msgtype, live_types(msgtype), fields, True, topic)
-            stream = _decoded(decoder, messages)
+            stream = _decoded(decoder, message)
         self._decoders[kind] = decoder
         return stream
 

@@ -16,7 +16,13 @@ from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.exact import META, restore
-from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
+from terrafusion.datasets.readers.ros.joints import (
+    joined,
+    joint_names,
+    steering_joints,
+    wheel_joints,
+    wheels_apart,
+)
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.static_frames import (
     STATIC,
@@ -83,7 +89,7 @@ def chosen_topics(
     """
     rig, joints = request.rig, joints_given(request.topics)
     with errors_of(request.path):
-        return choose_topics(
+        chosen, notes = choose_topics(
             topics_of(container),
             user=request.topics,
             usual=rig.topics if rig else None,
@@ -91,6 +97,12 @@ def chosen_topics(
             one_of=functools.partial(_one_sensor, container, rig, decide),
             is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
         )
+        if "wheels" not in chosen:
+            found = wheels_apart(topics_of(container), functools.partial(_joints, container), joints)
+            if found is not None:
+                chosen["wheels"] = found
+                notes.append(f"wheels: those of {', '.join(found.names)} together")
+        return chosen, notes
 
 
 def recording_of(container: BagContainer, request: Request) -> Recording:
@@ -279,8 +291,12 @@ def _streams(container: BagContainer, chosen: Mapping[str, BagTopic]) -> dict[st
     """The streams of the chosen topics that do hold messages, by channel."""
     asked: dict[Key, tuple[str, ...]] = {}
     for kind, topic in chosen.items():
-        key, fields = (topic.name, topic.msgtype), wanted_fields(kind, topic.msgtype)
-        asked[key] = (*asked.get(key, ()), *fields)
+        for name in topic.names:
+            key, fields = (name, topic.msgtype), wanted_fields(kind, topic.msgtype)
+            asked[key] = (*asked.get(key, ()), *fields)
     streams = read_streams(container, asked)
-    found = {kind: streams[topic.name, topic.msgtype] for kind, topic in chosen.items()}
+    found = {}
+    for kind, topic in chosen.items():
+        parts = [streams[name, topic.msgtype] for name in topic.names]
+        found[kind] = joined(parts) if topic.beside else parts[0]
     return {kind: stream for kind, stream in found.items() if len(stream)}

@@ -23,7 +23,12 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import turned_by
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.core.wrapped_angles import speeds_of, unwrapped_alone, unwrapped_beside_speeds
+from terrafusion.datasets.core.wrapped_angles import (
+    paired_sides,
+    speeds_of,
+    unwrapped_alone,
+    unwrapped_beside_speeds,
+)
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import (
     holding,
@@ -46,6 +51,8 @@ from terrafusion.datasets.readers.timed_tables import new_times
 NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
 MOVING_MPS = 0.05
+LEAST_APART = 3
+"""Messages of each wheel between which those of wheels apart are interpolated."""
 SIDEWAYS_SHARE = 0.5
 """Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
 
@@ -215,11 +222,7 @@ class ChannelBuilder:
             )
         held = holding(stream, [*joints.values()])
         if not held.any():
-            raise DataError(
-                f"no message holds all of the joints {', '.join(joints.values())}",
-                channel=stream.topic,
-                remedy="name the wheel joints with --topic joint.left=NAME --topic joint.right=NAME",
-            )
+            return self._wheels_apart(stream, t_ns, joints)
         stream, t_ns = stream.select(held), t_ns[held]
         speed = joint_values(stream, [*joints.values()], "velocity")
         angle = joint_values(stream, [*joints.values()], "position")
@@ -232,12 +235,7 @@ class ChannelBuilder:
             t_ns = t_ns[begin:]
         chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
         self.notes.append(f"wheels: joints of {stream.topic}: {chosen}")
-        if angle is not None and not self.as_written:
-            if speed is None:
-                angle, note = unwrapped_alone(angle, tuple(joints), stream.topic)
-            else:
-                angle, note = unwrapped_beside_speeds(angle, tuple(joints))
-            self.notes += [f"wheels: {stream.topic}: {note}"] if note else []
+        angle = self._unwrapped(angle, speed, tuple(joints), stream.topic)
         if speed is None and angle is not None and len(t_ns) > 1:
             keep, speed = speeds_of(t_ns, angle)
             angle, t_ns = angle[keep], t_ns[keep]
@@ -248,6 +246,42 @@ class ChannelBuilder:
             raise DataError("joints have neither velocity nor position", channel=stream.topic)
         self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
         return Wheels(t_ns, speed, tuple(joints), "radps", angle)
+
+    def _unwrapped(
+        self, angle: Array | None, speed: Array | None, names: tuple[str, ...], topic: str
+    ) -> Array | None:
+        """The angles (N, wheels) with whole turns; None where speeds take their place."""
+        if angle is None or self.as_written:
+            return angle
+        if speed is None:
+            angle, note = unwrapped_alone(angle, names, topic)
+        else:
+            angle, note = unwrapped_beside_speeds(angle, names)
+        self.notes += [f"wheels: {topic}: {note}"] if note else []
+        return angle
+
+    def _wheels_apart(self, stream: Stream, t_ns: TimesNs, joints: dict[str, str]) -> Wheels:
+        """Wheels of which each message holds some, at the times of the one that comes most."""
+        names, of = tuple(joints), [*joints.values()]
+        speed, angle = joint_values(stream, of, "velocity"), joint_values(stream, of, "position")
+        known = angle if speed is None else speed
+        if known is None or np.isfinite(known).sum(axis=0).min() < LEAST_APART:
+            raise DataError(
+                f"the messages do not hold speeds or angles of each of the joints {', '.join(of)}",
+                channel=stream.topic,
+                remedy="name the wheel joints with --topic joint.left=NAME --topic joint.right=NAME",
+            )
+        chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
+        self.notes.append(
+            f"wheels: joints of {stream.topic}, each in messages of its own: {chosen}; interpolated at the "
+            "times of the one with the most"
+        )
+        angle = self._unwrapped(angle, speed, names, stream.topic)
+        if speed is not None or angle is None:
+            return paired_sides(Wheels(t_ns, known, names, "radps", angle))
+        paired = paired_sides(Wheels(t_ns, angle, names, "radps"))  # angles in the place of speeds
+        keep, speed = speeds_of(paired.t_ns, paired.speed)
+        return Wheels(paired.t_ns[keep], speed, names, "radps", paired.speed[keep])
 
     def steering(self, stream: Stream, t_ns: TimesNs) -> Steering | None:
         """Steering angles, of joints or of an AckermannDrive."""

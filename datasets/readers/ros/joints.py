@@ -1,7 +1,7 @@
 """Wheels and steering axes among the joints of a JointState: which joint is which, and its values."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Steering, Wheels
+from terrafusion.datasets.readers.ros.layout import MessageBlock
 from terrafusion.datasets.readers.ros.streams import Stream
+from terrafusion.datasets.readers.ros.topics import JOINTS, BagTopic, looks_commanded
 
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _ENDS = {"front": "front", "f": "front", "rear": "rear", "back": "rear", "b": "rear", "hind": "rear"}
@@ -98,6 +100,50 @@ def joint_names(stream: Stream) -> list[str]:
     return list(dict.fromkeys(name for _, names in firsts for name in names))
 
 
+def joints_beside(topic: str, names: Sequence[str]) -> list[str]:
+    """The joints of a topic among those of others: behind its name where none of them has a place."""
+    placed = any(_place_of_joint(name) for name in names)
+    return list(names) if placed else [f"{topic}/{name}" for name in names]
+
+
+def wheels_apart(
+    bag: Sequence[BagTopic], joints_of: Callable[[str], Sequence[str]], named: dict[str, str]
+) -> BagTopic | None:
+    """JointStates that hold the wheels together, each some of them; None where they do not.
+
+    Args:
+        bag: topics with messages.
+        joints_of: names of the joints of a topic.
+        named: wheel -> joint, as the user says.
+    """
+    states = [topic for topic in bag if topic.msgtype == JOINTS and not looks_commanded(topic.name)]
+    joints = {topic.name: joints_beside(topic.name, joints_of(topic.name)) for topic in states}
+    wheels = wheel_joints([name for names in joints.values() for name in names], named).values()
+    holding = [topic for topic in states if not set(wheels).isdisjoint(joints[topic.name])]
+    if len(holding) < 2:
+        return None
+    first, *others = holding
+    return BagTopic(
+        first.name, JOINTS, sum(topic.count for topic in holding), tuple(topic.name for topic in others)
+    )
+
+
+def joined(streams: Sequence[Stream]) -> Stream:
+    """JointStates of several topics as those of one, in the order of their stamps."""
+    blocks, count = [], 0
+    for stream in streams:
+        for block in stream.blocks:
+            names = [joints_beside(stream.topic, row) for row in block.columns["name"].tolist()]
+            columns = block.columns | {"name": np.array(names, dtype=object)}
+            blocks.append(MessageBlock(block.rows + count, columns))
+        count += len(stream)
+    topic = " + ".join(stream.topic for stream in streams)
+    receipt_ns = np.concatenate([stream.receipt_ns for stream in streams])
+    whole = Stream(topic, streams[0].msgtype, receipt_ns, tuple(blocks))
+    times = receipt_ns if whole.header_ns is None else whole.header_ns
+    return whole.select(np.argsort(times, kind="stable"))
+
+
 def holding(stream: Stream, joints: Sequence[str]) -> Mask:
     """Mask (N,) of the messages that name all these joints."""
     held = np.zeros(len(stream), dtype=bool)
@@ -107,7 +153,7 @@ def holding(stream: Stream, joints: Sequence[str]) -> Mask:
 
 
 def joint_values(stream: Stream, joints: Sequence[str], path: str) -> Array | None:
-    """Values (N, k) of these joints: "velocity" or "position".
+    """Values (N, k) of these joints, "velocity" or "position"; NaN where a message does not name one.
 
     None where a message holds another number of values than of names, or no value is known at all.
     """
@@ -118,7 +164,9 @@ def joint_values(stream: Stream, joints: Sequence[str], path: str) -> Array | No
             continue  # drivers leave them out until the hardware answers
         if values is None or values.ndim != 2 or values.shape[1] != len(names):
             return None
-        out[rows] = values[:, [names.index(joint) for joint in joints]]
+        for k, joint in enumerate(joints):
+            if joint in names:
+                out[rows, k] = values[:, names.index(joint)]
     return None if np.isnan(out).all() else out
 
 

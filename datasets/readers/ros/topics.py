@@ -83,11 +83,17 @@ _LIKELY = re.compile(r"wheel|vel|speed|motor|enc|tick|rpm|odo|drive", re.IGNOREC
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of the bag: name, normalised type, number of messages."""
+    """A topic of the bag: name, normalised type, number of messages; `beside`: topics of the other wheels."""
 
     name: str
     msgtype: str
     count: int
+    beside: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its name and those beside it."""
+        return self.name, *self.beside
 
 
 def choose_topics(
@@ -189,6 +195,11 @@ def _asked_for(bag: list[BagTopic], kind: str, name: str) -> BagTopic:
         what = f"no topic {name} with messages in this bag"
         remedy = f"topics here: {', '.join(f'{t.name} ({t.msgtype})' for t in bag) or 'none'}"
     raise DataError(what, channel=kind, remedy=remedy)
+
+
+def looks_commanded(name: str) -> bool:
+    """Whether a topic's name says that its messages are commands."""
+    return bool(_COMMAND.search(name))
 
 
 def looks_fused(kind: str, topic: BagTopic) -> bool:

@@ -74,10 +74,21 @@ def test_angles_that_arrive_one_by_one_are_counted_as_in_a_log(steps: np.ndarray
     whole, _ = unwrapped(wrapped, ("left", "right"))
     assert whole is not None
     counter = TurnCounter()
-    arrived = np.array([counter.counted(row) for row in wrapped])
+    arrived = np.array([counter.counted(row, i * 10**9) for i, row in enumerate(wrapped)])
     np.testing.assert_array_equal(arrived[:, 0], whole[:, 0])
     if np.ptp(true) > 1.001 * TURN_RAD:
         np.testing.assert_array_equal(arrived[:, 1], true)
+
+
+@pytest.mark.parametrize("least", [0.0, -4 * TURN_RAD])
+def test_counters_that_arrive_one_by_one_roll_over_as_in_a_log(least: float) -> None:
+    true = 3.0 + np.concatenate([np.linspace(0.0, 120.0, 600), np.linspace(120.0, -60.0, 900)])
+    rolled = (true - least) % (8 * TURN_RAD) + least
+    counter = TurnCounter()
+    arrived = np.array([counter.counted(np.array([a]), i * 10**7)[0] for i, a in enumerate(rolled)])
+    # Each roll takes the step before it for its own.
+    np.testing.assert_allclose(np.diff(arrived), np.diff(true), atol=0.3)
+    np.testing.assert_allclose(arrived - arrived[0], true - true[0], atol=1.0)
 
 
 def test_missing_cells_stay_missing_and_the_other_wheel_keeps_its_bits() -> None:

@@ -52,6 +52,37 @@ def test_angles_that_do_not_tell_give_way_to_speeds(tmp_path: Path) -> None:
         open_recording(joint_bag(tmp_path / "alone", true % TURN))
 
 
+@pytest.mark.parametrize("speeds", [True, False])
+@pytest.mark.parametrize(
+    ("topics", "joints"),
+    [
+        (("/left/joint_states", "/right/joint_states"), ("wheel", "wheel")),
+        (("/wheel_a", "/wheel_b"), ("left_wheel_joint", "right_wheel_joint")),
+        (("/joint_states", "/joint_states"), ("left_wheel_joint", "right_wheel_joint")),
+    ],
+)
+def test_wheels_in_messages_of_their_own_are_brought_together(
+    topics: tuple[str, str], joints: tuple[str, str], speeds: bool, tmp_path: Path
+) -> None:
+    messages = imu_messages(MAKE2, n=300)
+    for k, (topic, joint) in enumerate(zip(topics, joints, strict=True)):
+        for i in range(60):
+            t, rate = T0 + i * 50_000_000 + k * 13_000_000, 3.0 + k
+            angle = rate * (t - T0) * 1e-9
+            one = MAKE2.joints(t, [joint], [angle], [rate] if speeds else [])
+            messages.append((topic, JOINTS, t, one))
+    recording = open_recording(write_ros2(tmp_path / "bag", sorted(messages, key=lambda one: one[2])))
+    wheels = recording.wheels
+    assert wheels is not None
+    assert wheels.names == ("left", "right")
+    assert len(wheels) >= 57
+    assert wheels.angle_rad is not None
+    np.testing.assert_allclose(wheels.speed, [[3.0, 4.0]] * len(wheels), rtol=1e-9)
+    t_s = (wheels.t_ns - T0) * 1e-9
+    np.testing.assert_allclose(wheels.angle_rad, np.outer(t_s, [3.0, 4.0]), atol=1e-9)
+    assert any("each in messages of its own: left = " in note for note in recording.notes)
+
+
 def test_joints_without_numbers_until_the_hardware_answers_are_left_out(tmp_path: Path) -> None:
     speed = np.full((20, 2), 2.0)
     speed[:3] = np.nan

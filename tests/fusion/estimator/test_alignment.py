@@ -237,3 +237,28 @@ def test_wheels_that_fall_silent_do_not_hold_up_the_start() -> None:
     for i in range(300):
         estimator.add_imu(i * 10_000_000, np.zeros(3), [0.0, 0.0, 9.81])
     assert states
+
+
+@pytest.mark.parametrize("off_s", [-100, -600_000_000, 100])
+def test_fixes_of_a_clock_that_is_wrong_do_not_hold_up_the_start(off_s: int) -> None:
+    """They are as none: the path is local once they have been waited for."""
+    estimator = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", start_without_gnss_s=3.0))
+    for t_ns in range(0, 4_000_000_000, 10_000_000):
+        if t_ns % 200_000_000 == 0:
+            estimator.add_gnss(t_ns + off_s * 1_000_000_000, [0.0, 0.0, 0.0], 1.0)
+        estimator.add_wheels(t_ns, 0.5, 0.5)
+        estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
+    assert estimator.status == "no_gnss"
+
+
+def test_few_fixes_and_then_none_hold_samples_for_a_while_only() -> None:
+    estimator = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", start_without_gnss_s=3.0))
+    held = 0
+    for t_ns in range(0, 25_000_000_000, 20_000_000):
+        if t_ns < 3_000_000_000 and t_ns % 1_000_000_000 == 0:
+            estimator.add_gnss(t_ns, [0.0, 0.0, 0.0], 1.0)
+        estimator.add_wheels(t_ns, 0.0, 0.0)
+        estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
+        held = max(held, len(estimator.imu.t_ns))
+    assert held <= 21 * 50
+    assert estimator.status == "no_gnss"

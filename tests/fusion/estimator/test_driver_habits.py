@@ -142,3 +142,22 @@ def test_odometry_is_the_same_whenever_it_is_asked_for(drive: Recording) -> None
             for name in ("position_m", "quaternion", "covariance", "twist_covariance"):
                 np.testing.assert_array_equal(getattr(now, name), getattr(fresh, name), err_msg=f"{i} {name}")
     assert compared > 20
+
+
+@pytest.mark.parametrize("started", [True, False])
+def test_what_comes_while_the_imu_is_silent_is_held_for_a_while_only(husky: Estimator, started: bool) -> None:
+    if started:
+        husky.set_start([0.0, 0.0, 0.0], 0.0)
+    for t_ns in range(0, 90 * 10**9, 2 * 10**7):
+        husky.add_wheels(t_ns, 1.0, 1.0)
+        if t_ns < 3 * 10**9 or t_ns > 85 * 10**9:
+            husky.add_imu(t_ns, np.zeros(3), GRAVITY)
+        if t_ns % 10**8 == 0:
+            husky.add_gnss(t_ns, [1e-9 * t_ns, 0.0, 0.0], 1.0)
+            husky.add_pressure(t_ns, 1e5)
+        held = len(husky.wheels.t_ns), len(husky.gnss.waiting), len(husky.aids.height._samples)
+        assert max(held) < 35 * 50
+        assert max(held[1:]) < 35 * 10
+    state = husky.latest()
+    assert state is not None
+    assert state.t_ns > 89 * 10**9

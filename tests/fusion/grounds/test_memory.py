@@ -12,9 +12,9 @@ import pytest
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.file import load_grounds, save_grounds
-from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Tally
+from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Ground, Tally
 from terrafusion.fusion.grounds.learner import StretchMeter
-from terrafusion.fusion.grounds.memory import DWELL, GroundMemory, merged
+from terrafusion.fusion.grounds.memory import DWELL, MOST_GROUNDS, GroundMemory, merged
 from terrafusion.fusion.grounds.signature import SIGNATURE, VIBRATION, SignatureExtractor
 from terrafusion.fusion.terrain.features import Window
 
@@ -145,6 +145,22 @@ def test_robots_of_one_type_share_their_grounds() -> None:
     assert both.grounds[0].windows > two_grounds(1).grounds[0].windows
 
 
+def test_many_grounds_of_several_robots_still_fit_into_a_file(tmp_path: Path) -> None:
+    """Those that were seen longest are kept."""
+    levels = np.linspace(-4.0, 4.0, MOST_GROUNDS + 3)
+    memory = GroundMemory()
+    for i, level in enumerate(levels.tolist()):
+        ground = Ground.new(f"ground {i + 1}")
+        for _ in range(40 + i):
+            ground = ground.seen(np.full(len(SIGNATURE), level), 1.0, "")
+        memory.grounds.append(ground)
+    both = merged([GroundMemory(memory.grounds[:8]), GroundMemory(memory.grounds[8:])])
+    save_grounds(both, tmp_path / "grounds.yaml")
+    again = load_grounds(tmp_path / "grounds.yaml")
+    assert len(again) == MOST_GROUNDS
+    assert min(ground.windows for ground in again.grounds) == 43
+
+
 def test_a_name_given_by_the_user_stays_and_two_of_one_name_become_one() -> None:
     memory = two_grounds().named({"ground 1": "lawn", "ground 2": "gravel"})
     assert {g.name for g in merged([memory, two_grounds(1)]).grounds} == {"lawn", "gravel"}
@@ -169,6 +185,7 @@ def test_a_file_gives_the_same_memory_and_holds_no_position(tmp_path: Path) -> N
         ("z_low", "z_lowest", "z_lowest"),
         ("name: ground 2", "name: ground 1", "different name"),
         ("friction_windows", "friktion_windows", "friktion_windows"),
+        ("slip: {mean: 0.0", "slip: {mean: 27.0", "'slip' has mean 27; give a share"),
     ],
 )
 def test_a_wrong_file_is_refused_in_a_line(tmp_path: Path, old: str, new: str, said: str) -> None:

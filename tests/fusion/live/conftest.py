@@ -14,6 +14,7 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
+from tests.fusion.live.bag_player import messages_of
 
 VEHICLE, SECONDS = "elevate", 15.0
 
@@ -41,3 +42,8 @@ def live_recording(live_bag: Path) -> Recording:
 def replayed(live_recording: Recording) -> Estimate:
     """The estimate of `replay`."""
     return replay(live_recording, vehicle=VEHICLE).estimate
+
+
+@pytest.fixture(scope="module")
+def messages(live_bag: Path) -> list[tuple[int, str, str, bytes]]:
+    return messages_of(live_bag)

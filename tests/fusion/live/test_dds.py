@@ -16,7 +16,8 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.live.dds import DdsBus, dds_type, raw_type, ros_type
 from terrafusion.fusion.live.serve import serve
 from tests.fusion.live.conftest import VEHICLE
-from tests.fusion.live.test_node import Run, error_m, same_bits
+from tests.fusion.live.node_run import Run, error_m
+from tests.fusion.live.test_node import same_bits
 
 pytest.importorskip("cyclonedds")
 

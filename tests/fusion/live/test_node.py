@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
 from terrafusion.datasets.core.channels import Imu, Wheels
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers import ros_messages as ros
@@ -21,53 +18,9 @@ from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.datasets.writers.mcap_file import TopicMessages
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.live.node import LiveNode, LiveOptions
 from terrafusion.fusion.replay import replay
-from tests.fusion.live.bag_player import messages_of
 from tests.fusion.live.conftest import VEHICLE
-
-BagMessage = tuple[int, str, str, bytes]
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-
-
-class Run:
-    """A node, what it said and published, and its states."""
-
-    def __init__(self, **options: Any) -> None:
-        self.said: list[str] = []
-        self.published: list[tuple[str, str, bytes]] = []
-        self.history = History()
-        self.node = LiveNode(
-            LiveOptions(**{"vehicle": VEHICLE, **options}),
-            lambda *message: self.published.append(message),
-            self.said.append,
-            self.history,
-        )
-
-    def feed(self, messages: Iterable[BagMessage], close: bool = True) -> Run:
-        """The messages at the pace of their times."""
-        first = None
-        for t, topic, msgtype, cdr in messages:
-            first = t if first is None else first
-            if self.node.wants(topic, msgtype):
-                self.node.receive(topic, msgtype, cdr, t)
-            self.now_s = self.begun_s + (t - first) * 1e-9
-            self.node.tick(self.now_s)
-        self.begun_s = self.now_s
-        if close:
-            self.node.close()
-        return self
-
-    begun_s = now_s = 1e6
-
-    def decoded(self, topic: str) -> list[Any]:
-        """What was published on a topic, by the decoder of rosbags."""
-        return [STORE.deserialize_cdr(cdr, kind) for name, kind, cdr in self.published if name == topic]
-
-
-@pytest.fixture(scope="module")
-def messages(live_bag: Path) -> list[BagMessage]:
-    return messages_of(live_bag)
+from tests.fusion.live.node_run import STORE, BagMessage, Run, error_m
 
 
 @pytest.fixture(scope="module")
@@ -107,16 +60,6 @@ def test_a_late_joiner_estimates_the_rest_as_replay_does(
     rest = replay(dataclasses.replace(live_recording, **parts), vehicle=VEHICLE).estimate
     late = [one for one in messages if one[0] >= begin or one[1] in ("/datum", "/tf_static")]
     assert same_bits(Run().feed(late).history, rest) == len(rest.trajectory) > 50
-
-
-def error_m(history: History, recording: Recording) -> float:
-    """Root mean square of the horizontal errors of the states with fixes."""
-    states = [state for state in history.states if state.status == "running"]
-    assert len(states) > 30
-    assert recording.truth is not None
-    truth = recording.truth.positions_at(np.array([state.t_ns for state in states]))
-    off = np.array([state.position_m for state in states]) - truth
-    return float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean()))
 
 
 def test_odometry_and_transforms_belong_together(run: Run) -> None:
@@ -184,70 +127,6 @@ def test_a_slow_imu_gets_the_graph_of_replay(messages: list[BagMessage], every: 
     assert run.node.estimator is not None
     assert run.node.estimator.config.inputs.imu == kind
     assert any("too few to integrate: a planar graph" in line for line in run.said) is (kind == "gyro_z")
-
-
-def broken(messages: list[BagMessage]) -> Iterable[BagMessage]:
-    """The messages, and beside them what a bad day of a robot sends."""
-    nan = np.full(3, np.nan).tobytes()
-    for i, (t, topic, msgtype, cdr) in enumerate(messages):
-        yield t, topic, msgtype, cdr
-        if i % 40 == 7:
-            yield t, topic, msgtype, cdr[: len(cdr) // 2]  # cut off
-        elif i % 40 == 17:
-            yield t, topic, msgtype, b""
-        elif i % 40 == 27:
-            yield t, topic, msgtype, cdr[:8] + bytes(4) + cdr[12:]  # another length of a text, or stamp
-        elif i % 40 == 37 and i > 1000 and topic == "/imu/data":
-            yield t, topic, msgtype, cdr[:-96] + nan + cdr[-72:]
-        elif i % 400 == 39 and topic == "/imu/data":
-            year = int.from_bytes(cdr[4:8], "little") + 31_536_000
-            yield t, topic, msgtype, cdr[:4] + year.to_bytes(4, "little") + cdr[8:]
-
-
-def test_bad_messages_are_refused_and_reported(messages: list[BagMessage], live_recording: Recording) -> None:
-    run = Run().feed(broken(messages))
-    assert run.node.counts["refused"] > 100
-    assert any(line.startswith("refused: /imu/data") for line in run.said)
-    assert len(run.said) < 60  # a kind of line once
-    assert error_m(run.history, live_recording) < 1.0
-
-
-def test_a_bag_that_starts_again_starts_the_estimator_anew(messages: list[BagMessage]) -> None:
-    run = Run().feed(messages[: len(messages) // 2], close=False)
-    run.feed(messages[: len(messages) // 2])
-    assert run.node.counts["resets"] == 1
-    assert any("went back by 7" in line for line in run.said)
-    times = np.array([state.t_ns for state in run.history.states])
-    (again,) = np.flatnonzero(np.diff(times) < 0)
-    assert abs(times[again + 1] - times[0]) < 200_000_000
-
-
-def ahead(message: BagMessage, seconds: int) -> BagMessage:
-    """A message of IMU, wheels or receiver whose stamp is ahead; the others as they are."""
-    t, topic, msgtype, cdr = message
-    if not msgtype.endswith(("/Imu", "/Odometry", "/JointState", "/NavSatFix")):
-        return message
-    stamp = int.from_bytes(cdr[4:8], "little") + seconds
-    return t, topic, msgtype, cdr[:4] + stamp.to_bytes(4, "little") + cdr[8:]
-
-
-def test_stamps_that_leap_without_a_pause_start_the_estimator_anew(messages: list[BagMessage]) -> None:
-    half = len(messages) // 2
-    run = Run().feed(messages[:half], close=False)
-    run.feed([ahead(message, 3600) for message in messages[half:]])
-    assert [line for line in run.said if "started anew" in line] == [
-        "started anew: the stamps of the IMU went ahead by 3600.5 s"
-    ]
-    times = np.array([state.t_ns for state in run.history.states])
-    assert np.diff(times).max() < 3610 * 10**9
-    assert times[-1] - times[0] > 3600 * 10**9, "the new clock is used"
-
-
-def test_stamps_that_leap_for_a_moment_are_refused(messages: list[BagMessage], replayed: Estimate) -> None:
-    few = [ahead(m, 3600) if i % 500 in (50, 51, 52) else m for i, m in enumerate(messages)]
-    run = Run().feed(few)
-    assert run.node.counts["resets"] == 0
-    assert np.linalg.norm(run.history.states[-1].position_m - replayed.trajectory.position_m[-1]) < 0.1
 
 
 def command(text: str) -> tuple[str, str, bytes, int]:
@@ -368,6 +247,28 @@ def test_wheels_of_every_type_carry_the_robot(
     assert error_m(run.history, live_recording) < 1.0
 
 
+def one_joint(t: int, name: str, angle: float) -> bytes:
+    layout = CdrTemplate().header("").strings([name]).constant("I", 1).constant("d", angle)
+    return split(layout.constant("I", 0, 0).stamped(np.array([t])))[0]
+
+
+def test_joints_in_topics_of_their_own_whose_counters_roll_over_carry_the_robot(
+    messages: list[BagMessage], live_recording: Recording
+) -> None:
+    wheels, kind, period = live_recording.wheels, "sensor_msgs/msg/JointState", 6.0 * np.pi
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    found = [one for one in messages if one[1] != "/joint_states" and not one[2].endswith("/Odometry")]
+    for t_ns, angles in zip(wheels.t_ns.tolist(), wheels.angle_rad % period, strict=True):
+        for name, angle in zip(wheels.names, angles.tolist(), strict=True):
+            found.append((t_ns, f"/{name}/joint_states", kind, one_joint(t_ns, "joint", angle)))
+    run = Run(frequency=2.0).feed(sorted(found, key=lambda one: one[0]))
+    assert run.node.counts["refused"] == 0, run.said
+    assert run.node.estimator is not None
+    assert (run.node.estimator.wheels.jumps, run.node.estimator.wheels.impossible) == (0, 0)
+    assert error_m(run.history, live_recording) < 0.1
+
+
 def test_time_is_that_of_the_simulator(messages: list[BagMessage]) -> None:
     run = Run(use_sim_time=True)
     assert run.node.wants("/clock", "rosgraph_msgs/msg/Clock")
@@ -393,12 +294,18 @@ def test_a_node_does_not_listen_to_itself() -> None:
         {"wait_s": 2.0},
         {"datum": (91.0, 0.0, 0.0)},
         {"datum": (-90.0, 0.0, 0.0)},
+        {"datum": (47.0, 8.0)},
         {"vehicle": "no such"},
     ],
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         Run(**options)
+
+
+def test_a_datum_that_is_no_number_is_refused() -> None:
+    with pytest.raises(DataError, match="no numbers"):
+        Run().node.set_datum("a", 8.0, 400.0)  # type: ignore[arg-type]
 
 
 def test_two_imus_are_a_question_and_no_end(messages: list[BagMessage]) -> None:
@@ -412,33 +319,3 @@ def test_two_imus_are_a_question_and_no_end(messages: list[BagMessage]) -> None:
     assert any("choose with --topic imu=" in line for line in run.said)
     chosen = Run(topics={"imu": "/imu/data"}).feed(both)
     assert chosen.history.states
-
-
-def test_a_sample_without_numbers_does_not_delay_the_start(messages: list[BagMessage]) -> None:
-    """One bad sample of the IMU each second from the first on: the others start the estimator."""
-    nan = np.full(3, np.nan).tobytes()
-    spoilt, seconds = [], set[int]()
-    for t, topic, msgtype, cdr in messages:
-        if topic == "/imu/data" and t // 10**9 not in seconds:
-            seconds.add(t // 10**9)
-            cdr = cdr[:-96] + nan + cdr[-72:]
-        spoilt.append((t, topic, msgtype, cdr))
-    run = Run().feed(spoilt)
-    assert run.node.estimator is not None
-    assert run.node.counts["refused"] == len(seconds)
-    assert any(line.startswith("refused: imu: a sample lacks numbers") for line in run.said)
-    assert run.history.states[0].t_ns - messages[0][0] < 4_000_000_000
-
-
-def test_an_imu_without_any_usable_sample_is_waited_for(messages: list[BagMessage]) -> None:
-    begin = messages[0][0] + 2_500_000_000
-    infinite = np.full(3, np.inf).tobytes()
-    late = [
-        (t, topic, msgtype, cdr[:-96] + infinite + cdr[-72:] if topic == "/imu/data" and t < begin else cdr)
-        for t, topic, msgtype, cdr in messages[: len(messages) // 2]
-    ]
-    run = Run().feed(late)
-    assert any(line.startswith("waiting: live, /imu/data") for line in run.said)
-    assert run.node.estimator is not None
-    assert run.node.estimator.config.inputs.imu == "six_axis"
-    assert run.history.states[0].t_ns > begin

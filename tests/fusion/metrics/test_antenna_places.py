@@ -18,3 +18,14 @@ def test_places_of_the_antenna_follow_each_other() -> None:
 def test_late_stamps_are_those_of_earlier_measurements() -> None:
     places = AntennaPlaces.fixed((0.0, 0.0, 0.0)).then(100, (0.0, 0.0, 0.0), 30)
     assert places.measured_ns(np.array([50, 99, 100, 150])).tolist() == [50, 99, 70, 120]
+
+
+def test_places_of_days_take_bounded_memory() -> None:
+    places = AntennaPlaces.fixed((0.0, 0.0, 0.0))
+    for k in range(1, 5001):
+        places = places.then(k, (float(k), 0.0, 0.0), k)
+    assert len(places.since_ns) == len(places.lever_m) == len(places.late_ns) <= 1000
+    assert places.at(np.array([5000]))[0, 0] == 5000.0
+    past = np.arange(5001)
+    assert (np.abs(places.at(past)[:, 0] - past) < 20).all()
+    assert (np.diff(places.since_ns) > 0).all()
