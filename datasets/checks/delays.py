@@ -238,6 +238,8 @@ ERROR_FROM_S = 0.5
 SLIDING_S = 2.0
 """The same where the others lag behind the wheels, as they do where a robot skids: at 1 m/s2 of traction it
 takes 3 s to reach 3 m/s, a mean delay of half of that."""
+MOST_LEFT = 0.9
+"""Share of what is not correlated without a lag beyond `ERROR_FROM_S` that may be left with it."""
 LEAST_LATE_S, SIGNIFICANT_S, MOST_REST = 0.3, 0.2, 0.97
 """Fixes count as late from the first on, with the interval of the delay beyond the second, and where that
 leaves no more than this share of the residuals."""
@@ -282,7 +284,7 @@ def sensor_lags(pairs: motion.SensorPairs) -> tuple[dict[motion.Pair, Lag], bool
         suspect = _matters(pair, lag, *signals)
         if suspect and pair[1] == "wheels" and lag.seconds < 0.0 and _follows(lag, *signals):
             wheels_slip = True
-        elif not suspect or not opposed(lag, *signals):
+        elif not suspect or not (opposed(lag, *signals) or _as_well_without(lag, *signals)):
             lags[pair] = _without_smoothing(lag, *signals) if suspect and pair[1] == "wheels" else lag
     return lags, wheels_slip
 
@@ -416,6 +418,14 @@ def opposed(lag: Lag, one: motion.Signal, other: motion.Signal) -> bool:
     return len(here) > 1 and -_correlation(here, there[0]) > _correlation(here, there[1]) - 0.1
 
 
+def _as_well_without(lag: Lag, one: motion.Signal, other: motion.Signal) -> bool:
+    """Whether the two agree about as well without a long lag: slip and slopes, no clock."""
+    (a, a_known), (here, here_known), (there, there_known) = _on_grid(one, other, 0.0, lag.seconds)
+    known = a_known & here_known & there_known
+    left, without = (1.0 - _correlation(a[known], b[known]) for b in (there, here))
+    return abs(lag.seconds) > ERROR_FROM_S and left > MOST_LEFT * without
+
+
 def _on_grid(one: motion.Signal, other: motion.Signal, *later_s: float) -> list[tuple[Array, Mask]]:
     """The first signal on a grid over the time of both, then the second so much later; and where known."""
     start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
@@ -429,7 +439,7 @@ def _resampled(grid_s: Array, signal: motion.Signal, origin_ns: np.int64) -> tup
     t_s, values = (signal[0][known] - origin_ns) * 1e-9, signal[1][known]
     after = np.clip(np.searchsorted(t_s, grid_s), 1, len(t_s) - 1)
     near = t_s[after] - t_s[after - 1] < 3.0 * period_s(signal[0])
-    return np.interp(grid_s, t_s, values), np.asarray(near)
+    return np.interp(grid_s, t_s, values), np.asarray(near & (grid_s >= t_s[0]) & (grid_s <= t_s[-1]))
 
 
 def _correlation(a: Array, b: Array) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, with_fields
 from terrafusion.datasets.checks.path import fit_windows, path_by
+from terrafusion.datasets.checks.truth import UNITS
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
@@ -19,6 +20,8 @@ DEGREE_RATIO, RADIAN_RATIO = (6e-6, 5e-5), (1e-7, 9e-7)
 SPEED_UNITS = {"km/h": 3.6, "knots": 1.943844, "miles/h": 2.236936, "cm/s": 100.0, "mm/s": 1000.0}
 UNIT_ERROR, ANGLE_ERROR, SURE_R = 0.1, np.radians(20.0), 0.8
 CHORD_S = (0.5, 10.0)
+MOST_SIGMA_M = 10.0
+"""No receiver that shows a unit has a larger sigma: it is in the unit of the positions."""
 
 
 def check_degrees(context: CheckContext) -> Iterator[Finding]:
@@ -131,7 +134,20 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
     """The receiver's velocities must be the rate of its positions."""
     gnss = context.recording.gnss
     fit = velocity_fit(gnss) if gnss is not None else None
-    if gnss is None or fit is None or _positions_mirrored(context, gnss):
+    if gnss is None or fit is None:
+        return
+    unit = _position_unit(fit)
+    if unit is not None:
+        sigmas = motion.typical_sigma(gnss) > MOST_SIGMA_M
+        yield Finding(
+            "gnss-unit", "error", "gnss",
+            f"positions look like {unit}",
+            f"they change {1.0 / abs(fit.factor):.4g} times as fast as the velocities say",
+            f"divide them by {UNITS[unit]:.6g}" + ", and their sigmas" * sigmas,
+            changed("gnss", _divided, factor=UNITS[unit], sigmas=sigmas),
+        )  # fmt: skip
+        return
+    if _positions_mirrored(context, gnss):
         return
     found = _velocity_fault(fit)
     if found is None:
@@ -143,6 +159,18 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
         f"{fit.mirrored_r:.2f} if mirrored"
     )
     yield Finding("gnss-velocity", "warning", "gnss", f"velocities {what}", evidence, fix, repair)
+
+
+def _position_unit(fit: VelocityFit) -> str | None:
+    """The unit that positions have if velocities are in m/s, where they run alike; None for metres."""
+    if fit.r < SURE_R or abs(np.angle(fit.factor)) > ANGLE_ERROR:
+        return None
+    return next((u for u, factor in UNITS.items() if abs(abs(fit.factor) * factor - 1.0) < UNIT_ERROR), None)
+
+
+def _divided(gnss: Gnss, factor: float, sigmas: bool) -> Gnss:
+    sigma = gnss.sigma_enu_m / factor if sigmas else gnss.sigma_enu_m
+    return dataclasses.replace(gnss, enu_m=gnss.enu_m / factor, sigma_enu_m=sigma)
 
 
 def _positions_mirrored(context: CheckContext, gnss: Gnss) -> bool:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from terrafusion.datasets.core.conventions import numbers_of, true_updates
 from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 
+C = TypeVar("C", bound=Channel)
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
 """Channels that are sampled evenly; terrain labels are not."""
 GAP_PERIODS, GAP_S = 5.0, 0.2
@@ -152,7 +154,8 @@ def _even(t_ns: TimesNs, gap_s: float) -> TimesNs:
 
 def check_jitter(context: CheckContext) -> Iterator[Finding]:
     """Intervals that scatter: times of arrival rather than of measurement."""
-    for name, channel in _clocked(context.recording):
+    for name, logged in _clocked(context.recording):
+        channel = _without_copies(logged)
         dt = np.diff(channel.t_ns) * 1e-9
         if len(dt) < LEAST_ROWS or coarse_tick_s(channel):
             continue
@@ -172,8 +175,19 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
             "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
             if regular
             else "use the sensor's own time stamps; the log does not have them",
-            retiming(name, lambda t_ns: _even(t_ns, GAP_S)) if regular else None,
+            changed(name, _evenly_timed) if regular else None,
         )  # fmt: skip
+
+
+def _without_copies(channel: C) -> C:
+    """Without rows that repeat time and numbers of the one before: written twice, they are no arrivals."""
+    new = true_updates(numbers_of(channel), len(channel))
+    return channel.select(new | (np.diff(channel.t_ns, prepend=channel.t_ns[0] - 1) > 0))
+
+
+def _evenly_timed(channel: C) -> C:
+    own = _without_copies(channel)
+    return dataclasses.replace(own, t_ns=_even(own.t_ns, GAP_S))
 
 
 def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:

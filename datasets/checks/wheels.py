@@ -258,8 +258,10 @@ BIAS_RADPS, REST_BIAS_RADPS, MOST_BIAS_RADPS = 0.005, 0.0005, 0.02
 """1 sigma of the gyro's bias where the log shows no rest, and where it does; more is no bias."""
 LARGE, SIGNIFICANT, WIDEST, MOST = 0.025, 0.015, 0.05, 0.3
 """A difference of radii counts from the first on, with its interval beyond the second and narrower than the
-third: in one long bend it cannot be distinguished from the track. Tyres of one robot
-differ by up to that much: a Warthog's by 1.7 % (norlab_drive)."""
+third. Tyres of one robot differ by up to that much: a Warthog's by 1.7 % (norlab_drive)."""
+TURNS, ONE_BEND = (10.0, 90.0), 0.25
+"""In one long bend a difference cannot be distinguished from the track, and on a slope slip varies with the
+heading: these percentiles of the yaw rate, positive to the side of most turns, must differ by this factor."""
 SLIP_FREE = 1.005
 
 
@@ -329,6 +331,9 @@ def radius_difference(context: CheckContext) -> BootstrapInterval | None:
     if moving.sum() < LEAST_BLOCKS * BLOCK or len(np.unique(blocks[moving])) < LEAST_BLOCKS:
         return None
     columns, difference, blocks = columns[moving], difference[moving], blocks[moving]
+    slow, fast = np.percentile(columns[:, 1] * np.sign(columns[:, 1].sum()), TURNS)
+    if slow > ONE_BEND * fast:
+        return None
     fit, *_ = np.linalg.lstsq(columns, difference, rcond=None)
     track, noise = max(float(fit[1]), LEAST_TRACK_M), float(np.std(difference - columns @ fit))
     sigma = track * (BIAS_RADPS if bias is None else REST_BIAS_RADPS)

@@ -226,6 +226,10 @@ def _signs(context: CheckContext, found: Agreements) -> Signs:
     centripetal = heading(context)
     if centripetal is not None and centripetal.turn and ("gyro", "wheels") in signs:
         signs["gyro", "accelerometer"] = centripetal.turn
+    if min(signs.values(), default=0.0) < 0.0 and "gyro" in known and ("gyro", "gnss") not in signs:
+        image = _image(context)  # where the course of the fixes is too coarse to judge between the others
+        if image:
+            signs["gyro", "gnss"] = -image
     return signs
 
 
@@ -258,6 +262,9 @@ def _evidence(pairs: list[tuple[str, str]], signs: Signs, found: Agreements) -> 
     turn = signs.get(("gyro", "accelerometer"), 0.0)
     if turn:
         parts.append(f"the specific force in turns {'agrees with' if turn > 0.0 else 'contradicts'} gyro z")
+    if ("gyro", "gnss") in signs and ("gyro", "gnss") not in found:
+        image = "mirror image of the " if signs["gyro", "gnss"] < 0.0 else ""
+        parts.append(f"the path of the fixes is the {image}path by gyro z")
     return ", ".join(parts)
 
 
@@ -282,7 +289,7 @@ LEAST_FIXES = 20
 CLEARER, LEAST_OFF_M, SCALES = 3.0, 1.0, (0.5, 1.5)
 """Ratio of what is left of the fixes about the path and about its image, and the least of the former, from
 which on the image is meant: a straight path and its image differ by nothing, noise and drift bring both near
-each other. The image must have about the scale of the path."""
+each other. What fits better must have about the scale of the path."""
 
 
 def check_mirrored(context: CheckContext) -> Iterator[Finding]:
@@ -294,7 +301,7 @@ def check_mirrored(context: CheckContext) -> Iterator[Finding]:
     if wheels is not None and wheels.r < 0.0:
         return  # the gyro is wrong
     left = residuals_m(context)
-    if left is None or left[0] < max(LEAST_OFF_M, CLEARER * left[1]):
+    if left is None or _image(context) <= 0.0:
         return
     fix, repair = reflection(context.recording)
     yield Finding(
@@ -306,6 +313,15 @@ def check_mirrored(context: CheckContext) -> Iterator[Finding]:
     )  # fmt: skip
 
 
+def _image(context: CheckContext) -> float:
+    """1 where the fixes fit the mirror image of the dead-reckoned path, -1 where the path, 0 if unclear."""
+    own, image = residuals_m(context) or (0.0, 0.0)
+    if max(own, image) < max(LEAST_OFF_M, CLEARER * min(own, image)):
+        return 0.0
+    return float(np.sign(own - image))
+
+
+@once
 def residuals_m(context: CheckContext) -> tuple[float, float] | None:
     """RMS distance of the fixes from the dead-reckoned path, and from its image; None where not comparable.
 
@@ -328,7 +344,7 @@ def residuals_m(context: CheckContext) -> tuple[float, float] | None:
             continue
         path, place = _averaged(t_s[rows], z[rows], fix[rows])
         own, image = _left(path, place), _left(path.conj(), place)
-        if not SCALES[0] <= image[1] <= SCALES[1]:
+        if not SCALES[0] <= min(own, image)[1] <= SCALES[1]:
             return None
         squares += [own[0], image[0]]
         count += len(place)

@@ -88,6 +88,7 @@ def replay(
             drive.
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
     """
+    from terrafusion.fusion.estimator.feed import wheels_of
     from terrafusion.fusion.grounds.file import read_grounds
     from terrafusion.fusion.replay import replay as run
     from terrafusion.fusion.reports.rerun_log import require_rerun
@@ -101,6 +102,8 @@ def replay(
     model = None if terrain_model is None else load_terrain_model(terrain_model)
     rig = common.load_rig(vehicle)
     recording = how.open(log, rig)
+    with errors_of(log):
+        wheels_of(recording)  # refused before faults that are repaired in vain without them
     findings = common.refuse_errors(log, recording, rig, learned=() if calibrate else ("imu-forward",))
     with common.progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(

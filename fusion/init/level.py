@@ -12,7 +12,6 @@ from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import imu_kind
 from terrafusion.fusion.init.draft import Draft, DraftLine
-from terrafusion.twin.model.vehicle import VehicleParams
 
 SLOPE_RAD = math.radians(5.0)
 """1 sigma of the slope of the ground (assumed): it tilts a robot as a mount does, but turns with heading."""
@@ -44,18 +43,19 @@ class Tilt:
         return math.acos(math.cos(self.roll_rad) * math.cos(self.pitch_rad))
 
 
-def measure_tilt(recording: Recording, base: VehicleParams) -> Tilt | None:
+def measure_tilt(recording: Recording, rig: Rig) -> Tilt | None:
     """The mean specific force of a drive, without that of its turns; None without six axes or wheels.
 
     Changes of speed cancel over a drive that ends as slow as it began, and slopes over all headings.
     """
-    imu, wheels = recording.imu, recording.wheels
+    imu, wheels, radius_m = recording.imu, recording.wheels, CheckContext(recording, rig).wheel_radius_m()
     if imu is None or wheels is None or len(imu) < 2 or not len(wheels) or imu_kind(imu) != "six_axis":
         return None
+    assert radius_m is not None  # the rig has one
     t = imu.t_ns * 1e-9
     step = np.diff(t, prepend=t[0])
     step[step > 1.0] = 0.0  # a gap says nothing
-    speed = wheels.side_speeds_mps(base.odometry.wheel_radius_m).mean(axis=1)
+    speed = wheels.side_speeds_mps(radius_m).mean(axis=1)
     rate = imu.gyro_radps[:, 2]
     force = imu.accel_mps2.copy()
     force[:, 1] -= rate * np.interp(t, wheels.t_ns * 1e-9, speed)

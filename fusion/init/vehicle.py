@@ -117,15 +117,15 @@ def first_vehicle(
         if axes or repaired:  # what is measured about z holds only now
             tail = axes | tail
             measured, geometry = _geometry(recording, answers, base, rig)
-        tilted, tilt_notes = tilt_lines(measure_tilt(recording, base), recording.name)
-        draft = head | geometry | tail | tilted
-        forward = forward_line(recording, load_vehicle(write_draft(file, draft, "draft")).rig())
+        draft = head | geometry | tail
+        tilted, tilt_notes = tilt_lines(measure_tilt(recording, _rig(draft, file)), recording.name)
+        draft |= tilted
+        forward = forward_line(recording, _rig(draft, file))
         start = write_draft(file, draft | forward, "draft")
         calibration, notes = _calibrated(recording, start, progress)
         if calibration is not None:
             draft |= forward | _learned_lines(calibration, draft, recording.imu is not None)
-            learned = load_vehicle(write_draft(file, draft, "draft")).rig()
-            findings = run_checks(recording, learned)
+            findings = run_checks(recording, _rig(draft, file))
     if extended != "generic":
         known = f"the log names its vehicle '{base.name}': --vehicle {extended} needs no new file"
         notes = (known, *notes)
@@ -219,8 +219,12 @@ def _mounted(
 
 
 def _read(open_log: Open, draft: Draft, file: Path) -> tuple[Recording, Rig]:
-    rig = load_vehicle(write_draft(file, draft, "draft")).rig()
+    rig = _rig(draft, file)
     return open_log(rig), rig
+
+
+def _rig(draft: Draft, file: Path) -> Rig:
+    return load_vehicle(write_draft(file, draft, "draft")).rig()
 
 
 def _calibrated(

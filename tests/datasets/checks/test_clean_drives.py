@@ -10,6 +10,7 @@ import pytest
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.simulate import simulate
 from tests.datasets.checks.test_physical_faults import (
     EFFECTIVE_TRACK_M,
     RADIUS_M,
@@ -86,3 +87,8 @@ def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
     """The yaw rate of the drive as commanded."""
     assert r.command is not None
     return np.interp(t_s, (r.command.t_ns - START_NS) * 1e-9, r.command.yaw_rate_radps)
+
+
+def test_circles_on_a_slope_are_no_deflated_tyre() -> None:
+    log = simulate("circle", vehicle="elevate", terrain="grass", slope_deg=12.0, seed=2)
+    assert "wheel-sides" not in {finding.code for finding in run_checks(without(log, "truth", "command"))}

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import delays, path_model, scale
+from terrafusion.datasets.checks import delays, path_model, run_checks, scale
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.known_delays import lag_with_sigma, on_one_clock
 from terrafusion.datasets.checks.motion import Pair, Signal
@@ -16,6 +16,8 @@ from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
 from tests.datasets.conftest import make_drive
 
 IMU: Pair = ("imu", "wheels")
@@ -201,6 +203,15 @@ def test_a_wrong_sign_is_no_clock() -> None:
     assert not delays.opposed(lag, wave(), wave(late_s=0.4))
     short = wave(seconds=0.02)
     assert not delays.opposed(lag, short, short)
+
+
+def test_speeds_that_fade_alike_are_no_clock() -> None:
+    """A robot that bogs down in mud: without its start, the path fades later as the wheels do now."""
+    log = simulate("waypoints", vehicle="warthog", terrain="mud", cross_slope_deg=-8.0, seed=27)
+    log = dataclasses.replace(log, terrain=None, terrain_name="")
+    assert "clock-offset" not in {finding.code for finding in run_checks(log, load_vehicle("warthog").rig())}
+    late = Lag(3.0, 2.9, 3.1, 0.99)
+    assert not delays._as_well_without(late, wave(), wave(late_s=3.0))
 
 
 def test_between_gaps_a_signal_is_not_known() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -30,7 +31,10 @@ def with_fixes(log: Recording, noise_m: float) -> Recording:
     assert gnss is not None
     noise = np.random.default_rng(1).normal(0.0, noise_m, gnss.enu_m.shape)
     sigma = np.full_like(gnss.sigma_enu_m, 2.0)
-    coarse = dataclasses.replace(gnss, enu_m=gnss.enu_m + noise, sigma_enu_m=sigma, velocity_enu_mps=None)
+    single = np.full_like(gnss.fix, Fix.SINGLE)
+    coarse = dataclasses.replace(
+        gnss, enu_m=gnss.enu_m + noise, sigma_enu_m=sigma, velocity_enu_mps=None, fix=single
+    )
     return dataclasses.replace(log, gnss=coarse)
 
 
@@ -72,3 +76,23 @@ def test_a_gyro_of_the_wrong_sign_is_not_put_down_to_the_fixes(coarse: Recording
     found = codes(dataclasses.replace(coarse, imu=turned))
     assert "gnss-course" not in found
     assert "yaw-sign" in found
+
+
+def test_fixes_too_coarse_for_courses_tell_swapped_wheels_from_a_gyro_of_the_wrong_sign(
+    coarse: Recording,
+) -> None:
+    bare = dataclasses.replace(coarse, truth=None, command=None)
+    assert bare.imu is not None
+    assert bare.wheels is not None
+    gyro = bare.imu.gyro_radps
+    level = dataclasses.replace(bare.imu, accel_mps2=np.full_like(gyro, np.nan))
+    bare = dataclasses.replace(bare, imu=level)
+    assert codes(bare) == set()
+    exchanged = dataclasses.replace(bare.wheels, speed=bare.wheels.speed[:, [1, 0, 3, 2]])
+    mended, found = repair(dataclasses.replace(bare, wheels=exchanged), RIG)
+    assert [finding.code for finding in found] == ["wheel-swap"]
+    assert mended.wheels is not None
+    np.testing.assert_array_equal(mended.wheels.speed, bare.wheels.speed)
+    turned = dataclasses.replace(level, gyro_radps=gyro * [1.0, 1.0, -1.0])
+    _, found = repair(dataclasses.replace(bare, imu=turned), RIG)
+    assert [(finding.code, "assumed" in finding.fix) for finding in found] == [("yaw-sign", False)]

@@ -300,6 +300,8 @@ MENDED: dict[str, tuple[Fault, str, str]] = {
     "truth backward": (lambda r: truth_yawed(r, 180.0), "truth-yaw", "warning"),
     "truth askew": (lambda r: truth_yawed(r, -50.0), "truth-yaw", "warning"),
     "truth in mm": (lambda r: truth_scaled(r, 1000.0), "truth-unit", "error"),
+    "positions in feet": (gnss_with(enu_m=scaled(1 / 0.3048)), "gnss-unit", "error"),
+    "positions in mm": (gnss_with(enu_m=scaled(1e3), sigma_enu_m=scaled(1e3)), "gnss-unit", "error"),
     "velocity in knots": (gnss_with(velocity_enu_mps=scaled(1.943844)), "gnss-velocity", "warning"),
     "velocity swapped": (gnss_with(velocity_enu_mps=columns(1, 0, 2)), "gnss-velocity", "warning"),
     "velocity north negative": (gnss_with(velocity_enu_mps=times(1, -1, 1)), "gnss-velocity", "warning"),

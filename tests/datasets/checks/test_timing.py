@@ -290,12 +290,13 @@ def test_other_clocks_of_other_lengths_are_not_repaired(drive: Recording) -> Non
     assert (finding.code, finding.repair) == ("no-common-time", None)
 
 
-def test_repeated_times_keep_their_first_row(drive: Recording) -> None:
+@pytest.mark.parametrize("twice", [[10, 20, 20], list(range(0, 300, 3))])
+def test_repeated_times_keep_their_first_row(drive: Recording, twice: list[int]) -> None:
     assert drive.gnss is not None
-    index = np.sort(np.r_[np.arange(len(drive.gnss)), 10, 20, 20])
+    index = np.sort(np.r_[np.arange(len(drive.gnss)), twice])
     corrupted = dataclasses.replace(drive, gnss=drive.gnss.select(index))
     (finding,) = found_in(corrupted)
-    assert (finding.code, finding.what) == ("repeated-times", "3 repeated times")
+    assert (finding.code, finding.what) == ("repeated-times", f"{len(twice)} repeated times")
     repaired, _ = repair(corrupted)
     assert repaired.gnss is not None
     np.testing.assert_array_equal(repaired.gnss.t_ns, drive.gnss.t_ns)

@@ -110,6 +110,10 @@ ALL = slice(None)
 BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "no meta": (without("meta.yaml"), ("log", "no meta.yaml", "write meta.yaml")),
     "no wheels": (without("wheels.csv"), ("log", "no wheel speeds", "wheels.csv")),
+    "no wheels, gyro in deg/s": (
+        lambda log: [without("wheels.csv")(log), scaled("imu.csv", SIX[:3], 57.29578)(log)],
+        ("log", "no wheel speeds", "wheels.csv"),
+    ),
     "no channel": (
         without(*(f"{c}.csv" for c in ("command", "wheels", "imu", "gnss", "motor", "terrain", "truth"))),
         ("no channel", "add at least one"),
