@@ -99,8 +99,14 @@ def _description(setup: RunSetup, noise: NoiseStreams) -> str:
 
 
 def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | VehicleParams) -> list[str]:
-    """When the robot would tip over, and how many numbers of vehicle (as given) and soils are assumed."""
-    notes = []
+    """Sensors slower than declared, when the robot would tip over, and how many numbers are assumed."""
+    sensors = setup.vehicle.sensors
+    imu_hz = sensors.imu.rate_hz
+    notes = [
+        f"{name} at {imu_hz:g} Hz, not {spec.rate_hz:g}: the twin samples no sensor faster than the IMU"
+        for name in ("wheels", "gnss", "barometer", "magnetometer")
+        if (spec := getattr(sensors, name)) is not None and spec.rate_hz > imu_hz
+    ]
     rows = np.arange(0, len(motion.t_s), _TIPPING_ROWS)
     shares = wheel_shares(motion.yaw_rad[rows], setup.vehicle, *setup.scenario.plane())
     tipped = rows[shares.min(axis=1) <= 0.0]

@@ -63,7 +63,7 @@ class RunSetup:
         Raises:
             ConfigError: slip outside the range for which a soil was measured.
         """
-        slip = slip_ratios(driven, motion, self.vehicle)
+        slip = slip_ratios(driven, motion, self.vehicle, self.plant)
         check_slip(self.route, self.plant.route.field, self.t_s, driven.states, slip)
         return slip, summarise(driven, motion, self.vehicle, slip)
 

@@ -66,7 +66,7 @@ def calibrate(
     Example: terrafusion calibrate monday tuesday --sensors --out my_robot.yaml
 
     Args:
-        vehicle: Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs'.
+        vehicle: Vehicle to start from, by name or YAML file. Default: the logs'.
         sensors: Learn antenna, gyro, wheel scale and delays from fixes, without any twin; writes a vehicle
             file. Takes --vehicle and how logs are read, no other option.
         terrain (SOIL|LABEL=SOIL): Soil of all logs, by name or YAML file; or of one label (repeat). Default:
@@ -95,11 +95,11 @@ def calibrate(
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
+    from terrafusion.twin.model.choose import vehicle_of_logs
 
     _check_slope(slope_deg)
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
-    vehicle = vehicle or "elevate"
     recordings = how.open_all(logs, common.load_rig(vehicle))
     with common.progress_bar("calibrating") as progress:
         found = fit(
@@ -108,8 +108,9 @@ def calibrate(
             slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
         )  # fmt: skip
     given = dict.fromkeys(found.model.soils, soils) if isinstance(soils, str) else soils
-    write_calibration(out, found, vehicle, given, {"command": common.command_line()})
-    return _shown(found, vehicle, out, suggest)
+    began = str(vehicle_of_logs(recordings, vehicle)[0])
+    write_calibration(out, found, began, given, {"command": common.command_line()})
+    return _shown(found, began, out, suggest)
 
 
 def _check_slope(slope_deg: float) -> None:

@@ -16,7 +16,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.scenario.scenario import Interval
+from terrafusion.twin.scenario.scenario import DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate, simulate_run
 
 
@@ -136,6 +136,26 @@ def test_an_offset_centre_of_gravity_turns_the_robot_and_keeps_truth_at_the_orig
     velocity = np.einsum("nij,nj->ni", R, truth.twist_body[:, :3])
     stepped = np.diff(truth.position_m, axis=0) * 100.0
     assert np.abs(stepped - 0.5 * (velocity[1:] + velocity[:-1])).max() < 2e-3
+
+
+@pytest.mark.parametrize("effect", ["wheel_radius/scale", "wheel_radius/build_up"])
+def test_wheels_of_another_size_do_not_slip_for_it(effect) -> None:
+    summary = simulate_run("straight", terrain="asphalt", effects={effect: 0.2}, noiseless=True).summary
+    assert summary.mean_slip_ratio < 0.002
+    assert summary.mean_abs_slip > 0.1  # the odometry does not know
+
+
+@pytest.mark.parametrize("drive", ["ackermann", "four_wheel_steer"])
+@pytest.mark.parametrize("v_mps", [0.8, -0.8])
+def test_steered_wheels_that_roll_around_a_curve_do_not_slip(drive, v_mps) -> None:
+    vehicle = load_vehicle("generic")
+    vehicle = dataclasses.replace(vehicle, drive=dataclasses.replace(vehicle.drive, type=drive))
+    segments = (DriveSegment(1.0), DriveSegment(9.0, v_mps, curvature_per_m=0.8))
+    summary = simulate_run(
+        Scenario("curve", 10.0, drive=segments, route=(RouteLeg("asphalt"),)), vehicle=vehicle, noiseless=True
+    ).summary
+    assert summary.mean_slip_ratio < 0.002
+    assert summary.mean_abs_slip < 0.005
 
 
 @pytest.mark.parametrize(

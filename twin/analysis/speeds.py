@@ -19,6 +19,8 @@ CUTOFF_HZ = 1.0
 """Usual cut-off of the low-pass on all velocity profiles (assumed)."""
 MOVING_MPS = 0.1
 """Usual threshold of the true speed above which errors and slip are averaged (assumed)."""
+LEAST_FILTERED = 10
+"""The filter is continued by 9 samples at both ends, which a series has to have."""
 REST_S = 2.0
 """The forward acceleration's mean over this first rest is taken off (the study's figure)."""
 AVERAGE_S = 0.5
@@ -26,7 +28,8 @@ AVERAGE_S = 0.5
 
 
 def speed_errors(recording: Recording, wheel_radius_m: float) -> dict[str, float]:
-    """Mean of |v - v_gt| / |v_gt|, percent, over samples of the wheels that move; NaN without any.
+    """Mean of |v - v_gt| / |v_gt|, percent, over samples of the wheels that move; NaN without any, or
+    without fixes then.
 
     Of the speeds by "odometry", "imu" and "gnss", all low-passed.
 
@@ -34,7 +37,7 @@ def speed_errors(recording: Recording, wheel_radius_m: float) -> dict[str, float
         ValueError: the recording lacks wheels, IMU, GNSS or truth with its twist.
     """
     wheels, imu, gnss, truth = recording.wheels, recording.imu, recording.gnss, recording.truth
-    if not (wheels and imu and gnss and truth) or truth.twist_body is None:
+    if wheels is None or imu is None or gnss is None or truth is None or truth.twist_body is None:
         raise ValueError("errors of speed need wheels, IMU, GNSS and truth with its twist")
     t_s, t_truth, t_imu, t_gnss = (
         np.asarray((one.t_ns - recording.start_ns) * 1e-9) for one in (wheels, truth, imu, gnss)
@@ -55,6 +58,8 @@ def speed_errors(recording: Recording, wheel_radius_m: float) -> dict[str, float
 
 def match(t_s: Array, values: Array, wanted_s: Array) -> Array:
     """Nearest value (M,) to each wanted time, NaN where none lies within 50 ms."""
+    if not len(t_s):
+        return np.full(len(wanted_s), np.nan)
     right = np.clip(np.searchsorted(t_s, wanted_s), 1, len(t_s) - 1)
     nearest = right - (wanted_s - t_s[right - 1] < t_s[right] - wanted_s)
     near = np.abs(t_s[nearest] - wanted_s) <= MATCH_S + 1e-9
@@ -62,9 +67,14 @@ def match(t_s: Array, values: Array, wanted_s: Array) -> Array:
 
 
 def low_pass(t_s: Array, values: Array, cutoff_hz: float = CUTOFF_HZ) -> Array:
-    """Evenly sampled values (N,) through a second-order Butterworth, forwards and backwards: no lag."""
+    """Evenly sampled values (N,) through a second-order Butterworth, forwards and backwards: no lag.
+
+    A series too short for the filter stays as it is.
+    """
     from scipy.signal import butter, sosfiltfilt
 
+    if len(values) < LEAST_FILTERED:
+        return values
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     if cutoff_hz >= 0.45 * rate_hz:
         return values

@@ -7,9 +7,11 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import STEERED_DRIVES
+from terrafusion.twin.model.measurement import rolling
 from terrafusion.twin.model.motion import BodyMotion
+from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, state_slice
+from terrafusion.twin.physics.layout import INDEX, SIDES, state_slice
 from terrafusion.twin.scenario.commands import DrivenStates, wheel_angles
 
 MOVING_MPS = 0.1
@@ -28,8 +30,8 @@ class RunSummary:
 
     `mean_abs_slip` is the mean of |1 - v_odom / v_truth| over samples with
     |v_truth| > 0.1 m/s (the source study's proxy, eq. 2), `mean_slip_ratio`
-    that of the usual |w R - u| / max(|w R|, |u|); both NaN for a run that never
-    moves. `energy_j` is drawn from the battery, `motor_work_j` done at the
+    that of the wheels' mean of the usual (w R - u) / max(|w R|, |u|), without its sign; both NaN for a run
+    that never moves. `energy_j` is drawn from the battery, `motor_work_j` done at the
     wheels; their difference is `heat_j`, in battery, motors, gearboxes and braking.
     `slip_work_j` is spent in the slip of the wheels, `resistance_work_j`
     in rolling, compaction and drag; what is left of the motors' work is in height and speed.
@@ -58,16 +60,17 @@ class RunSummary:
     resistance_work_j: float
 
 
-def slip_ratios(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams) -> Array:
-    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest; u is along the wheel."""
-    rim = driven.states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
-    half = 0.5 * vehicle.body.track_m * np.array(SIDES)
-    hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
-    if vehicle.drive.type in STEERED_DRIVES:
-        ahead = 0.5 * vehicle.body.wheelbase_m * np.array(ENDS)
-        across = motion.velocity_body_mps[:, 1:2] + motion.yaw_rate_radps[:, None] * ahead
-        angle = wheel_angles(driven.inputs, vehicle)
-        hub = np.cos(angle) * hub + np.sin(angle) * across
+def slip_ratios(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams, plant: Plant) -> Array:
+    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest; u is along the wheel.
+
+    Radii and places of the wheels are those that the plant's effects make of the vehicle's.
+    """
+    if plant.effect_names():
+        rim, hub = rolling(driven.states, driven.inputs, plant)
+    else:
+        rim = driven.states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
+        half = 0.5 * vehicle.body.track_m * np.array(SIDES)
+        hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
     larger = np.maximum(np.abs(rim), np.abs(hub))
     return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)
 
@@ -76,7 +79,10 @@ def summarise(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams, 
     """The run in a few numbers, from its states and slip ratios (N, 4)."""
     states, t_s = driven.states, motion.t_s
     speed = motion.velocity_body_mps[:, 0]
-    odometry = states[:, state_slice("wheel_speed")].mean(axis=1) * vehicle.odometry.wheel_radius_m
+    turned = states[:, state_slice("wheel_speed")]
+    if vehicle.drive.type in STEERED_DRIVES:  # the part of a wheel's way that is ahead
+        turned = turned * np.cos(wheel_angles(driven.inputs, vehicle))
+    odometry = turned.mean(axis=1) * vehicle.odometry.wheel_radius_m
     moving = np.abs(speed) > MOVING_MPS
     distance = float(np.sum(np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1)))
     drawn, work, slipped, resisted = (

@@ -11,9 +11,13 @@ from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.identifiability import NOT_IDENTIFIED, Identifiability
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise_learning import by_channel
+from terrafusion.twin.calibrate.predict import input_delay_s
 from terrafusion.twin.calibrate.problem import Problem, ResidualBlock
 from terrafusion.twin.calibrate.result import Calibration, ChannelFit, FittedParameter
 from terrafusion.twin.calibrate.solver import OUTCOMES, Solution
+
+LATE_S = 0.15
+"""Commands that the wheels follow later than this are noted: speed loops of shipped vehicles take 0.1 s."""
 
 
 def answer_of(
@@ -45,7 +49,7 @@ def answer_of(
         tuple(fitted), cov / np.outer(sigma, sigma), cov * np.outer(rate, rate), identified,
         _marked(problem.model_at(point.w), fitted), problem.model, channels, errors,
         solution.outcome, OUTCOMES[solution.outcome], solution.runs, problem.seconds(),
-        (*notes, *misfits, *_assumptions(problem)),
+        (*notes, *misfits, *_late(problem, point.w), *_assumptions(problem)),
     )  # fmt: skip
 
 
@@ -109,6 +113,21 @@ def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) ->
         c.name, c.unit, c.value(w), c.rate(w) * sigma, c.value(w - 2.0 * sigma), c.value(w + 2.0 * sigma),
         c.start, c.prior, c.rate(0.0), status, ratio, w <= low + 1e-9 or w >= high - 1e-9,
     )  # fmt: skip
+
+
+def _late(problem: Problem, w: Array) -> list[str]:
+    """Where a robot follows its commands later than its twin: other numbers then explain that."""
+    model, notes = problem.model_at(w), []
+    for log in problem.logs:
+        dead_time_s = input_delay_s(log, model, model.effects)
+        late_s = log.lateness_s(dead_time_s)
+        if late_s is not None and late_s > LATE_S:
+            notes.append(
+                f"{log.name}: the wheels follow the commands {late_s:.2f} s after the dead time of "
+                f"{dead_time_s:.2f} s, so that numbers are biased: calibrate vehicle.drive.dead_time_s, too, "
+                "correct the limits of acceleration in the vehicle's file, or use --input wheels"
+            )
+    return notes
 
 
 def _assumptions(problem: Problem) -> list[str]:

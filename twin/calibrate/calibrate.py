@@ -28,6 +28,7 @@ from terrafusion.twin.calibrate.start import (
     start_model,
     uniquely_named,
 )
+from terrafusion.twin.model.choose import vehicle_of_logs
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
@@ -46,7 +47,7 @@ _GROUND = {
 
 def calibrate(
     logs: Log | Sequence[Log],
-    vehicle: str | Path | VehicleParams = "elevate",
+    vehicle: str | Path | VehicleParams | None = None,
     soils: Soils = None,
     parameters: str | Sequence[str] = PARAMETERS,
     *,
@@ -66,8 +67,8 @@ def calibrate(
 
     Args:
         logs: recordings, or paths or catalogue names.
-        vehicle: name, YAML file or `VehicleParams` to start from; the geometry that a log reports
-            (`Recording.overrides`) replaces its own.
+        vehicle: name, YAML file or `VehicleParams` to start from, by default the one that the logs name, else
+            a generic one; the geometry that a log reports (`Recording.overrides`) replaces its own.
         soils: the ground of all logs (name, file or `SoilParams`); or grounds by the logs' labels; None:
             each label's soil of the library.
         parameters: dotted names, see `model`.
@@ -88,9 +89,11 @@ def calibrate(
         TerrafusionError: the twin diverges at the start values.
     """
     # Inputs, checked.
-    known = as_vehicle(vehicle)
-    recordings = uniquely_named(tuple(opened(logs, known.rig())))
+    recordings = uniquely_named(tuple(opened(logs, None if vehicle is None else as_vehicle(vehicle).rig())))
     _check(recordings, source, window_s)
+    named, said = vehicle_of_logs(recordings, vehicle)
+    known = as_vehicle(named)
+    recordings = tuple(opened(recordings, known.rig()))
     for key, value in (("slope_deg", slope_deg), ("aspect_deg", aspect_deg), ("payload_kg", payload_kg)):
         checked_number(value, _GROUND[key], file="the calibration", key=key)
     # The model to start from, and its unknown parameters.
@@ -110,7 +113,7 @@ def calibrate(
     problem = Problem(prepared, model, coordinates, robust=robust)
     solution, covariance, identified = _search(problem, progress)
     # The answer.
-    notes += [f"{log.name}: {note}" for log in prepared for note in log.notes]
+    notes += [*said, *(f"{log.name}: {note}" for log in prepared for note in log.notes)]
     return answer_of(problem, solution, covariance, identified, notes)
 
 

@@ -30,6 +30,9 @@ AROUND_S = 15.0
 """The heading at a window's start is that of the track this long before and after."""
 LEAST_SPREAD = 5.0
 """A track gives a heading when it spreads over this many sigma of its positions."""
+LATEST_S, UNEXPLAINED = 1.0, 0.4
+"""Delays of the wheels up to the first are tried; the best one counts where it leaves less than this share of
+the squared difference between commands and wheels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,25 @@ class PreparedLog:
         if self.commanded is None:
             return self
         return dataclasses.replace(self, sides=self.commanded.sides(vehicle))
+
+    def lateness_s(self, dead_time_s: float) -> float | None:
+        """By how much longer than the dead time the wheels follow the commands; None where no delay explains
+        most of what commands and wheels differ by."""
+        names = ("wheel_left_radps", "wheel_right_radps")
+        sides = [(o, self.sides[:, names.index(o.channel)]) for o in self.observed if o.channel in names]
+        if self.follows or len(sides) < len(names):
+            return None
+        grid, lags = DT_S * np.arange(len(self.sides)), np.arange(0.0, LATEST_S, 2.0 * DT_S)
+        middles = [0.5 * (o.begin_s + o.end_s) - dead_time_s for o, _ in sides]
+        left = [
+            sum(
+                float(np.sum((np.interp(t_s - lag, grid, side) - o.value) ** 2))
+                for t_s, (o, side) in zip(middles, sides, strict=True)
+            )
+            for lag in lags
+        ]
+        best = int(np.argmin(left))
+        return float(lags[best]) if left[best] < UNEXPLAINED * left[0] else None
 
     def seconds(self) -> float:
         """Length of what is compared, s."""

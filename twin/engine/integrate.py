@@ -4,8 +4,6 @@ Both backends run the same graph with the same step, inputs linear between
 samples and the soil following the route; they agree to rounding.
 """
 
-import math
-
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
@@ -13,14 +11,11 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.engine.native import Driver, driver
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.model.plant import Plant
-from terrafusion.twin.physics.layout import INPUTS, STATES, VEHICLE_PARAMETERS
+from terrafusion.twin.physics.layout import INPUTS, STATES
 
 BACKENDS = ("auto", "c", "vm")
-MAX_STEP_S = 1.0 / 300.0
-"""Longest RK4 step."""
-MAX_STEP_LAGS = 5.0 / 3.0
-"""Longest RK4 step in motor lags, the fastest mode of the model: RK4 is stable to 2.78 of them."""
 
 
 def integrate(
@@ -42,12 +37,12 @@ def integrate(
         plant: vehicle, ground and optional effects.
         t0_s: time of the first sample (matters for routes over time).
         backend: "c", "vm", or "auto" (C where a compiler is found).
-        substeps: RK4 steps a sample; by default `steps_a_sample`.
+        substeps: RK4 steps a sample; by default `stable_steps`.
 
     Raises:
         TerrafusionError: the state ceased to be finite (the message names the time).
     """
-    steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
+    steps = substeps if substeps is not None else stable_steps(dt_s, plant, 4)
     x0, inputs = checked(x0, inputs)
     native = chosen(backend, Variant(SINGLE, plant.effect_names(), plant.route.is_fixed()))
     if native is None:
@@ -97,12 +92,6 @@ def raise_if_diverged(states: Array, t0_s: float, dt_s: float) -> None:
             time_s=t0_s + int(bad[0]) * dt_s,
             remedy="check the vehicle's and the soil's parameters",
         )
-
-
-def steps_a_sample(dt_s: float, vehicle: Array) -> int:
-    """RK4 steps in a sample interval: few enough to be fast, short enough for the vehicle's motor lag."""
-    lag_s = float(vehicle[VEHICLE_PARAMETERS.index("lag_s")])
-    return max(1, math.ceil(dt_s / min(MAX_STEP_S, MAX_STEP_LAGS * lag_s) - 1e-9))
 
 
 def compiled() -> bool:

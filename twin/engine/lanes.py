@@ -16,8 +16,9 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
-from terrafusion.twin.engine.integrate import chosen, steps_a_sample
+from terrafusion.twin.engine.integrate import chosen
 from terrafusion.twin.engine.native import CPlant, Driver
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import INPUTS, STATES
 
@@ -47,7 +48,7 @@ def integrate_many(
         plants: B vehicles, grounds and optional effects.
         t0_s: time of the first sample.
         backend: "c", "vm", or "auto" (C where a compiler is found).
-        substeps: RK4 steps a sample; by default each run's own `steps_a_sample`.
+        substeps: RK4 steps a sample; by default each run's own `stable_steps`.
         every: only every so many-th sample is returned, from the first on.
         jobs: threads (compiled code runs outside Python's global lock).
         order: of the Runge-Kutta steps, 4 or 3 (a quarter less work).
@@ -109,7 +110,7 @@ class Fleet:
         alike: dict[tuple[tuple[str, ...], bool, int], list[int]] = defaultdict(list)
         for i, plant in enumerate(plants):
             own = substeps[i] if isinstance(substeps, Sequence) else substeps
-            steps = own if own is not None else steps_a_sample(dt_s, plant.vehicle)
+            steps = own if own is not None else stable_steps(dt_s, plant, order)
             alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
         tasks: list[_Task] = []
         for (effects, fixed, steps), runs in alike.items():

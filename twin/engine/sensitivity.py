@@ -14,8 +14,9 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import TANGENT, Variant
-from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
+from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged
 from terrafusion.twin.engine.native import MAX_BLOCKS
+from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
@@ -79,7 +80,7 @@ def integrate_with_sensitivity(
         ValueError: an array is misshapen.
     """
     x0, inputs = checked(x0, inputs)
-    steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
+    steps = substeps if substeps is not None else stable_steps(dt_s, plant, 4)
     effects = plant.effect_names(directions.effects)
     tangents = _tangents(plant, directions, effects)
     fixed = plant.route.is_fixed()

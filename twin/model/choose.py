@@ -1,6 +1,7 @@
 """The vehicle of a recording: the one asked for or named by the log, with the log's own geometry."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,28 @@ def named_vehicle(recording: Recording) -> str | None:
         remedy = "correct the path in its meta.yaml, or give --vehicle FILE"
         raise ConfigError(what, file=recording.name, remedy=remedy)
     return name
+
+
+def vehicle_of_logs(
+    recordings: Sequence[Recording], vehicle: str | Path | VehicleParams | None = None
+) -> tuple[str | Path | VehicleParams, tuple[str, ...]]:
+    """The vehicle of logs without their own geometry: as asked for, or named by all, or `generic`; notes.
+
+    Raises:
+        DataError: they name several, or none that is known and lack wheel radius or track.
+        ConfigError: a log names a file that is not there.
+    """
+    if vehicle is not None:
+        return vehicle, ()
+    first = named_vehicle(recordings[0])
+    for recording in recordings[1:]:
+        if (name := named_vehicle(recording)) != first:
+            raise DataError(
+                f"its vehicle is '{name or 'unknown'}', that of {recordings[0].name} '{first or 'unknown'}'",
+                file=recording.name,
+                remedy="give logs of one vehicle, or say which by --vehicle",
+            )
+    return (first, ()) if first is not None else ("generic", choose_vehicle(recordings[0])[1])
 
 
 def _missing_geometry(recording: Recording, overrides: Overrides) -> list[str]:

@@ -15,6 +15,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.dynamics import ARGUMENTS, ModelGraph, graph, origin_velocity
+from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.physics.layout import INDEX, INPUTS, MOUNTING, OUTPUTS, VEHICLE_PARAMETERS, WHEELS
 
 _NAMES = [*ARGUMENTS, "mounting"]
@@ -116,6 +117,24 @@ def corrections(
     """`correction` (N, Y) at many samples; arguments as for `measured`."""
     names = tuple(sorted(effects))
     return _columns(correction(names), states, inputs, vehicle, soil, mounting, effects)[0][:, :, 0]
+
+
+def rolling(states: Array, inputs: Array, plant: Plant) -> tuple[Array, Array]:
+    """Speed (N, 4) of each wheel's rim and of its hub along it, m/s, as the plant's effects have them."""
+    ground = np.tile(plant.route.soil[0], len(WHEELS))  # they do not depend on it
+    effects = {name: plant.effects[name] for name in plant.effect_names()}
+    function, mounting = _rolling(tuple(effects)), np.zeros(len(MOUNTING))
+    rim, hub = _columns(function, states, inputs, plant.vehicle, ground, mounting, effects)
+    return rim[:, :, 0], hub[:, :, 0]
+
+
+@functools.cache
+def _rolling(effects: tuple[str, ...]) -> Any:
+    import casadi as ca
+
+    speeds = [ca.vertcat(*(w[name] for w in graph(effects).wheels)) for name in ("rim_mps", "hub_x_mps")]
+    arguments = _expressions(effects)[0]
+    return ca.Function("tf_rolling", arguments, speeds, _NAMES, ["rim", "hub"], {"cse": True})
 
 
 def _columns(

@@ -94,8 +94,8 @@ def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
 def steering_angles(twist: Array, dt_s: float, vehicle: VehicleParams, start: float = 0.0) -> Array:
     """Angle (N,) of the front wheels, rad (bicycle model), by which a steered vehicle follows twists (N, 2).
 
-    The curvature is yaw rate over speed, within the limits of the angle and of its rate, from the angle
-    `start`; below `STANDING_MPS` the angle stays.
+    The curvature is yaw rate over speed as commanded (within the limits of acceleration both change apart),
+    within those of the angle and of its rate, from the angle `start`; below `STANDING_MPS` the angle stays.
     """
     steering = vehicle.steered()
     if steering is None:
@@ -174,7 +174,7 @@ def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[A
     sent = within_limit(scenario.commanded(fine_s), dt / parts, scenario)
     twist = limit_slew(sent, dt / parts, vehicle, np.zeros(2))[::parts]
     commanded = sent[::parts]
-    axles = axle_angles(steering_angles(twist, dt, vehicle), vehicle)
+    axles = axle_angles(steering_angles(commanded, dt, vehicle), vehicle)
     return commanded, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s, axles)
 
 
@@ -215,7 +215,7 @@ def _steer(
         sent = within_limit(held, dt / parts, scenario, float(commanded[first, 0]))
         commanded[rows] = sent[parts - 1 :: parts]
         twists[rows] = limit_slew(sent, dt / parts, vehicle, twists[first])[parts - 1 :: parts]
-        front[rows] = steering_angles(twists[rows], dt, vehicle, float(front[first]))
+        front[rows] = steering_angles(commanded[rows], dt, vehicle, float(front[first]))
         known = max(0, first - reach)
         some = slice(known, last + 1)
         sides, axles = side_speeds(twists[some], vehicle), axle_angles(front[some], vehicle)

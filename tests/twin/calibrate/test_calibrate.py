@@ -176,6 +176,12 @@ def test_dead_time() -> None:
     assert found[name].sigma < 0.01
 
 
+@pytest.mark.parametrize(("source", "late"), [("auto", True), ("wheels", False)])
+def test_wheels_that_follow_their_commands_late_are_noted(source: str, late: bool) -> None:
+    fit = calibrate(drive(dead_time_s=0.2), "elevate", SOIL, ("vehicle.body.mass_kg",), source=source)
+    assert any("s after the dead time of 0.00 s" in note for note in fit.notes) == late
+
+
 def test_driven_by_measured_wheels() -> None:
     names = NAMES[:4]
     mass = {"vehicle.body.mass_kg": TRUTH["vehicle.body.mass_kg"]}

@@ -158,6 +158,11 @@ def test_a_wrong_vehicle_is_noted() -> None:
     assert off in [channel.misfit() for channel in wrong.channels]
 
 
+def test_the_vehicle_to_start_from_is_that_of_the_log() -> None:
+    named = dataclasses.replace(drive(), vehicle="husky")
+    assert calibrate(named, soils=SOIL, parameters=NAMES[2]).before.vehicle.body.mass_kg == 50.0
+
+
 def test_logs_of_one_name_stay_apart_and_geometries_agree() -> None:
     found = calibrate([drive(), drive()], "elevate", SOIL, NAMES)
     assert list(found.sensor_errors) == ["short", "short (2)"]

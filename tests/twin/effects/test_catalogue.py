@@ -11,7 +11,7 @@ import pytest
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES, Form, one
-from terrafusion.twin.engine.integrate import MAX_STEP_S
+from terrafusion.twin.engine.stability import MAX_STEP_S
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.measurement import correction, measured, measurement
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS

@@ -54,17 +54,6 @@ def test_order_of_convergence_is_four_where_inputs_are_smooth(run) -> None:
     assert errors[0] / errors[1] > 10.0
 
 
-def test_longer_lag_allows_longer_steps_and_shorter_lag_asks_for_shorter() -> None:
-    from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
-
-    vehicle = np.ones(len(VEHICLE_PARAMETERS))
-    lag = VEHICLE_PARAMETERS.index("lag_s")
-    vehicle[lag] = 0.002
-    assert integrate.steps_a_sample(0.01, vehicle) == 3
-    vehicle[lag] = 0.001
-    assert integrate.steps_a_sample(0.01, vehicle) == 6
-
-
 @pytest.mark.parametrize("backend", ["auto", "vm"])
 def test_divergence_names_its_time(run, backend) -> None:
     sides = np.zeros((101, 2))

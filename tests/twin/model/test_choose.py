@@ -12,7 +12,7 @@ from terrafusion.datasets.core.channels import Imu, Steering, Wheels
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES
-from terrafusion.twin.model.choose import choose_vehicle
+from terrafusion.twin.model.choose import choose_vehicle, vehicle_of_logs
 from terrafusion.twin.model.vehicle import load_vehicle, reported_geometry
 
 NAMELESS = Recording("run", 0)
@@ -27,6 +27,22 @@ def test_the_log_names_the_vehicle_unless_another_is_asked_for() -> None:
     named = dataclasses.replace(NAMELESS, vehicle="husky")
     assert choose_vehicle(named)[0].name == "husky"
     assert choose_vehicle(named, "warthog")[0].name == "warthog"
+
+
+def test_logs_name_the_vehicle_they_are_calibrated_from() -> None:
+    husky, warthog = (dataclasses.replace(NAMELESS, name=name, vehicle=name) for name in ("husky", "warthog"))
+    assert vehicle_of_logs([husky, husky]) == ("husky", ())
+    assert vehicle_of_logs([husky, warthog], "elevate") == ("elevate", ())
+    with pytest.raises(DataError, match="warthog: its vehicle is 'warthog', that of husky 'husky'"):
+        vehicle_of_logs([husky, warthog])
+    unknown = dataclasses.replace(
+        husky, vehicle="rover", overrides=Overrides(wheel_radius_m=0.2, track_m=0.6)
+    )
+    name, notes = vehicle_of_logs([unknown])
+    assert name == "generic"
+    assert "unknown vehicle 'rover': the generic vehicle is used" in notes[0]
+    with pytest.raises(DataError, match="names no vehicle"):
+        vehicle_of_logs([NAMELESS])
 
 
 def test_without_a_name_the_geometry_of_the_log_is_needed() -> None:

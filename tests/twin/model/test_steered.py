@@ -139,6 +139,17 @@ def test_the_angle_follows_within_its_limits() -> None:
     assert held[1] == held[0]  # a car cannot turn on the spot
 
 
+@pytest.mark.parametrize("drive", STEERED)
+def test_a_car_that_sets_off_or_brakes_keeps_to_its_curve(drive: str) -> None:
+    """The speed follows slowly, the curvature is the commanded one from the start to the end."""
+    vehicle = steered(drive)
+    slow = dataclasses.replace(vehicle, drive=dataclasses.replace(vehicle.drive, max_accel_mps2=0.3))
+    segments = (DriveSegment(6.0, v_mps=1.0, yaw_rate_radps=0.2), DriveSegment(4.0))
+    scenario = Scenario("start", 10.0, drive=segments, route=(RouteLeg("asphalt"),))
+    states = simulate_run(scenario, vehicle=slow, noiseless=True).states
+    assert states[-1, INDEX["yaw"]] == pytest.approx(0.2 * states[-1, INDEX["travel"]], rel=0.03)
+
+
 def test_the_log_of_a_steered_drive(tmp_path: Path) -> None:
     """steering.csv holds the angle, with noise, scale and zero of the vehicle; other drives have none."""
     assert simulate(bend(0.8, 0.3, 3.0)).steering is None

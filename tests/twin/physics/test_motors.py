@@ -229,7 +229,8 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     states[:, state_slice("wheel_speed")] = wheel_radps
     driven = DrivenStates(setup.scenario.commanded(setup.t_s), np.zeros((len(states), len(INPUTS))), states)
     motion = setup.motion(driven)
-    summary = summarise(driven, motion, setup.vehicle, slip_ratios(driven, motion, setup.vehicle))
+    slip = slip_ratios(driven, motion, setup.vehicle, setup.plant)
+    summary = summarise(driven, motion, setup.vehicle, slip)
     assert summary.immobilised_cause == cause
     assert summary.immobilised_at_s == pytest.approx(3.0)  # from its first command on
 

@@ -55,6 +55,16 @@ def test_imu_at_rest_feels_gravity_only() -> None:
     assert np.abs(recording.imu.gyro_radps).max() < 1e-9
 
 
+def test_a_sensor_that_cannot_be_as_fast_as_declared_is_noted() -> None:
+    elevate = load_vehicle("elevate")
+    slow = dataclasses.replace(elevate.sensors.imu, rate_hz=20.0)
+    slow_imu = dataclasses.replace(elevate, sensors=dataclasses.replace(elevate.sensors, imu=slow))
+    short = dataclasses.replace(PARKED, duration_s=5.0)
+    notes, usual = (simulate(short, vehicle=v).notes for v in (slow_imu, elevate))
+    assert "wheels at 20 Hz, not 50: the twin samples no sensor faster than the IMU" in notes
+    assert not any("faster than the IMU" in note for note in usual)
+
+
 def test_imu_noise_has_the_stated_density_and_walk() -> None:
     spec = load_vehicle("elevate").sensors.imu
     imu = simulate(PARKED, seed=5).imu

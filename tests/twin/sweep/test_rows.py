@@ -11,6 +11,7 @@ import pytest
 
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates
+from terrafusion.twin.scenario.scenario import Interval
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweep import rows as rows_module
 from terrafusion.twin.sweep.load import load_sweep
@@ -115,6 +116,16 @@ def test_seeds_change_sensors_only(tmp_path: Path) -> None:
         assert min(first, second) > 0.0
     without = all_rows(sweep_of(tmp_path, "{terrain: [medium_sand], seed: [1]}"))
     assert without[0]["energy_j"] == found[0]["energy_j"]
+
+
+@pytest.mark.parametrize("lost_s", [15.0, 9.5])
+def test_a_run_without_fixes_has_its_other_results(tmp_path: Path, lost_s: float) -> None:
+    sweep = sweep_of(tmp_path, "{terrain: [medium_sand]}", "sensors: true\n")
+    dark = dataclasses.replace(sweep.scenario, gnss_outages=(Interval(0.0, lost_s),))
+    (row,) = all_rows(dataclasses.replace(sweep, scenario=dark))
+    assert row["status"] == DONE
+    assert row["odometry_error_pct"] is not None
+    assert (row["gnss_error_pct"] is None) == (lost_s > 12.0)
 
 
 def test_a_run_that_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
