@@ -134,7 +134,7 @@ def replay(
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
     changes = [*history.changes, *estimator.weights.take_changes()]
-    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
+    estimate = history.estimate(estimator.weights.detector.classes, changes, notes, recording.start_ns)
 
     outages = tuple(outages)
     scores, alone, verdict = judged(

@@ -90,9 +90,13 @@ class History:
             self.states = [rounded(gnss.open_heading.widened(state)) for state in self.states]
 
     def estimate(
-        self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]
+        self,
+        classes: tuple[str, ...],
+        changes: list[WeightChange],
+        notes: tuple[str, ...],
+        start_ns: int = 0,
     ) -> Estimate:
-        """All keyframes as arrays along time."""
+        """All keyframes as arrays along time, of a recording that began at `start_ns`."""
         states = self.states
 
         def stack(name: str, width: tuple[int, ...] = ()) -> np.ndarray:
@@ -133,4 +137,5 @@ class History:
             linear=stack("linear", (len(LINEAR),)),
             linear_sigma=stack("linear_sigma", (len(LINEAR),)),
             linear_names=LINEAR,
+            start_ns=start_ns,
         )
