@@ -194,7 +194,8 @@ def _run_estimator(
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
 
     def keyframe(state: State) -> None:
-        history.add(state, estimator.weights.noise, estimator.weights.take_changes())
+        weights = estimator.weights
+        history.add(state, weights.noise, weights.take_changes(), weights.found_ground)
         if watch is not None:
             watch(estimator)
 

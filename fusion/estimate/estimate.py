@@ -120,7 +120,8 @@ class Estimate:
 
     `trajectory` has the twist (body) and the covariance of every keyframe; the
     other arrays run along it. `classes` names the columns of `terrain`, `linear_names` those of `linear`.
-    `start_ns` is that of the recording, from which `t_s` counts.
+    `start_ns` is that of the recording, from which `t_s` counts. `found_ground` (N,) names the ground that
+    the robot found itself where no class describes it, else "".
     """
 
     trajectory: Trajectory
@@ -145,6 +146,7 @@ class Estimate:
     linear_sigma: Array | None = None
     linear_names: tuple[str, ...] = ()
     start_ns: int = 0
+    found_ground: NDArray[Any] | None = None
 
     def __repr__(self) -> str:
         t_ns = self.trajectory.t_ns
@@ -207,3 +209,10 @@ class Estimate:
     def dominant_terrain(self) -> NDArray[Any]:
         """The most probable class (N,) at each keyframe."""
         return np.array(self.classes)[self.terrain.argmax(axis=1)]
+
+    def ground(self) -> NDArray[Any]:
+        """The ground (N,) at each keyframe: one that the robot found, else the most probable class."""
+        classes = self.dominant_terrain()
+        if self.found_ground is None:
+            return classes
+        return np.where(self.found_ground != "", self.found_ground, classes)

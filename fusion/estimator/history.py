@@ -31,9 +31,13 @@ class History:
         self.noises: list[SensorNoise] = []
         self.innovations: list[Innovation] = []
         self.changes: list[WeightChange] = []
+        self.found_grounds: list[str] = []
 
-    def add(self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
-        """A keyframe, the sensor noise it was made with, and the changes of weights before it."""
+    def add(
+        self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = (), found_ground: str = ""
+    ) -> None:
+        """A keyframe, the sensor noise it was made with, the changes of weights before it, and its ground."""
+        self.found_grounds.append(found_ground)
         self.states.append(state)
         self.noises.append(noise)
         self.changes.extend(changes)
@@ -138,4 +142,5 @@ class History:
             linear_sigma=stack("linear_sigma", (len(LINEAR),)),
             linear_names=LINEAR,
             start_ns=start_ns,
+            found_ground=np.array(self.found_grounds, dtype=object),
         )
