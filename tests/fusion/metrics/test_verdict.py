@@ -97,6 +97,17 @@ def test_an_error_beyond_five_sigma_is_not_good(drive, offset_m, value):
     assert ("five times its own sigma" in " ".join(found.reasons)) == (value == "doubtful")
 
 
+@pytest.mark.parametrize(("until_s", "slip"), [(20.0, True), (60.0, False)])
+def test_slip_without_fixes_is_named_where_it_explains_the_error(drive, until_s, slip):
+    """The estimate goes on at the speed of the wheels, 0.5 m/s too fast."""
+    d = drive(seconds=60.0, turn_radps=0.0, drift_mps=0.5, drift_from_s=20.0, sigma_m=0.5)
+    used = d.fixes.between(int(d.fixes.t_ns[0]), int(d.fixes.t_ns[0] + until_s * 1e9))
+    found = " ".join(verdict(dataclasses.replace(d, fixes=used)).reasons)
+    assert "five times its own sigma" in found
+    assert ("without fixes from 19 s on the robot moved 41.0 m, the estimate 61.0 m" in found) == slip
+    assert ("the wheels slipped more" in found, "IMU mounting" in found) == (slip, not slip)
+
+
 def test_a_sigma_too_small_is_named(drive):
     d = drive(noise_m=0.35, sigma_m=0.1)
     assert "NEES" in " ".join(verdict(d, estimate=consistent(d)).reasons)
