@@ -298,6 +298,7 @@ def test_a_likely_delay_beyond_the_sigma_of_the_position_is_not_good(drive, dela
     found = verdict(d, truth=False, estimate=consistent(d), corrections=corrections)
     assert found.value == value, found
     assert ("the fixes seem 0.30 s" in found.reasons[0].lower()) == (value == "doubtful")
+    assert verdict(d, estimate=consistent(d), corrections=corrections).value == "good", "its errors are small"
 
 
 def places(d, lever_m=(0.0, 0.0, 0.0), late_s=0.0, from_s=20.0):
