@@ -134,7 +134,7 @@ def replay(
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
     changes = [*history.changes, *estimator.weights.take_changes()]
-    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
+    estimate = history.estimate(estimator.weights.detector.classes, changes, notes, recording.start_ns)
 
     outages = tuple(outages)
     scores, alone, verdict = judged(
@@ -194,7 +194,8 @@ def _run_estimator(
     archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
 
     def keyframe(state: State) -> None:
-        history.add(state, estimator.weights.noise, estimator.weights.take_changes())
+        weights = estimator.weights
+        history.add(state, weights.noise, weights.take_changes(), weights.found_ground)
         if watch is not None:
             watch(estimator)
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from terrafusion.datasets.catalog.catalog import load_catalog
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.cli import demo
 from terrafusion.fusion.cli.main import app
@@ -161,6 +162,18 @@ def test_the_tests_that_a_page_names_exist() -> None:
     }
     assert len(named) >= 10
     assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
+def test_a_log_on_a_page_is_in_the_catalogue_or_made_there() -> None:
+    """So that every command can be typed; logs in other folders have names of days or files."""
+    logs = {
+        log.split("#")[0]
+        for page in DOCUMENTS
+        for log in re.findall(r"terrafusion \w+ (\w+/[\w/]+(?:#\d+)?)", page.read_text(encoding="utf-8"))
+    }
+    known = load_catalog().recordings()
+    assert len(logs) >= 5
+    assert [log for log in sorted(logs) if not log.startswith("today/") and log not in known] == []
 
 
 def test_pictures_are_small() -> None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +86,12 @@ def set_up(
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.
     """
+    if not (terrain is None or isinstance(terrain, str | Path)):
+        raise ConfigError(f"terrain is {terrain!r}", remedy="give the name of one ground, or its file")
+    numbers = {"slope_deg": slope_deg, "cross_slope_deg": cross_slope_deg, "payload_kg": payload_kg}
+    for key, value in numbers.items():
+        if not (value is None or isinstance(value, Real)):
+            raise ConfigError(f"'{key}' is {value!r}", remedy="give a number")
     vehicle = as_vehicle(vehicle)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     scenario = scenario.with_ground(terrain, slope_deg, cross_slope_deg)

@@ -7,7 +7,7 @@ policy = terrafusion.policy.fit("policy.yaml", seeds=3)  # from drives of the tw
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.arguments import checked_whole
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 from terrafusion.fusion.noise.policy import load_policy as load
 
@@ -41,8 +41,7 @@ def fit(
     from terrafusion.fusion.training.policy_logs import read_logs
     from terrafusion.fusion.training.simulated_runs import GROUNDS
 
-    if seeds < 1:
-        raise ConfigError(f"{seeds} seeds", remedy="give a whole number from 1")
+    checked_whole(seeds, "seeds", 1)
     logged = read_logs([str(log) for log in logs], vehicle) if logs else LoggedSamples()
     fitted = fit_policy(default_grid(seeds, tuple(GROUNDS), vehicle), progress or (lambda: None), logged)
     write_policy(fitted, Path(out), made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")

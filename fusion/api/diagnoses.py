@@ -2,8 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
+from terrafusion.datasets.core.arguments import checked_names, checked_whole
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.reports.gap import write_diagnosis
@@ -67,10 +70,13 @@ def diagnose(
         ConfigError: an unknown effect, soil or vehicle.
         DataError: a log without what the diagnosis needs, or given twice.
     """
-    params = as_vehicle(vehicle)
+    params, seed = as_vehicle(vehicle), checked_whole(seed, "seed")
+    if not isinstance(significance, Real):
+        raise ConfigError(f"'significance' is {significance!r}", remedy="give a number from 0.001 to 0.5")
     judged, normal = opened(runs, params.rig()), opened(references, params.rig())
     result = run(
-        judged, normal, params, terrain, effects=[effects] if isinstance(effects, str) else effects,
+        judged, normal, params, terrain,
+        effects=None if effects is None else checked_names(effects, "effects"),
         significance=significance, seed=seed,
         progress=progress,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.grounds.file import read_grounds
 from terrafusion.fusion.grounds.memory import GroundMemory
-from terrafusion.fusion.metrics.scores import Outage, as_outage
+from terrafusion.fusion.metrics.scores import Outage, as_outages
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult
@@ -115,7 +115,7 @@ def replay(
         vehicle=vehicle,
         mode=mode,
         policy=policy,
-        outages=[as_outage(pair) for pair in outages],
+        outages=as_outages(outages),
         batch=batch,
         progress=progress,
         magnetometer=magnetometer,

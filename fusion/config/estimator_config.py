@@ -47,6 +47,17 @@ _RANGES = {
 }
 
 
+_KINDS: tuple[tuple[str, type, str, str], ...] = (
+    ("rig", Rig, "rig", "give Vehicle.load(NAME).rig(), or use Estimator.for_vehicle(NAME)"),
+    ("policy", Policy, "policy", "give a Policy, as of `policy.load(FILE)`"),
+    ("terrain_model", TerrainModel, "terrain model", "give the file that `terrafusion terrain train` wrote"),
+    ("grounds", GroundMemory, "memory of grounds", "give the `grounds` of a result"),
+)
+"""Fields that are objects: their type, what it is called, and what to give."""
+_NONE = ("terrain_model", "grounds")
+"""Those of them that may be absent."""
+
+
 @dataclass(frozen=True)
 class EstimatorConfig:
     """Settings of an `Estimator`.
@@ -111,9 +122,10 @@ class EstimatorConfig:
         return self.start_without_gnss_s if self.inputs.gnss else 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.rig, Rig):
-            remedy = "give Vehicle.load(NAME).rig(), or use Estimator.for_vehicle(NAME)"
-            raise ConfigError(f"a {type(self.rig).__name__} is no rig", remedy=remedy)
+        for key, kind, what, remedy in _KINDS:
+            value = getattr(self, key)
+            if not (isinstance(value, kind) or (value is None and key in _NONE)):
+                raise ConfigError(f"a {type(value).__name__} is no {what}", remedy=remedy)
         if self.terrain_model is not None:
             model = self.terrain_model
             if self.vehicle not in model.vehicles:

@@ -26,6 +26,7 @@ STATUS = {
     "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }
 """Values of a status and the sentence that explains each."""
+BIASES = (*(f"gyro_bias_{a}_radps" for a in "xyz"), *(f"accel_bias_{a}_mps2" for a in "xyz"))
 JUMPED = "the fixes jumped as no robot moves, while wheels and gyro agree with them before and after"
 """Why a fix was not used that follows such a jump."""
 
@@ -119,6 +120,8 @@ class Estimate:
 
     `trajectory` has the twist (body) and the covariance of every keyframe; the
     other arrays run along it. `classes` names the columns of `terrain`, `linear_names` those of `linear`.
+    `start_ns` is that of the recording, from which `t_s` counts. `found_ground` (N,) names the ground that
+    the robot found itself where no class describes it, else "".
     """
 
     trajectory: Trajectory
@@ -142,6 +145,8 @@ class Estimate:
     linear: Array | None = None
     linear_sigma: Array | None = None
     linear_names: tuple[str, ...] = ()
+    start_ns: int = 0
+    found_ground: NDArray[Any] | None = None
 
     def __repr__(self) -> str:
         t_ns = self.trajectory.t_ns
@@ -165,31 +170,49 @@ class Estimate:
         return text_html(repr(self))
 
     def to_pandas(self) -> pd.DataFrame:
-        """One row a keyframe, indexed by `t_ns`: pose, twist, biases, slip, terrain posterior and status.
+        """One row a keyframe, indexed by `t_ns`: the columns of `estimate.csv`, and more of pose and twist.
 
-        Columns carry their units; `p_<class>` are probabilities, `sigma_<name>` is 1 sigma of a column, and
-        the linear states have the names of `linear_names`.
+        Columns carry their units; those that the file has too are described in docs/reference/outputs.md.
+        The others: body twist `vx_mps` to `wz_radps`, 1 sigma of height, roll and pitch.
         """
-        table = self.trajectory.to_pandas()
-        if self.trajectory.covariance is not None:
-            for i, name in enumerate(("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")):
-                table[f"sigma_{name}"] = np.sqrt(self.trajectory.covariance[:, i, i])
+        import pandas as pd
+
+        path = self.trajectory
+        table: dict[str, Any] = {"t_s": (path.t_ns - self.start_ns) * 1e-9}
+        table |= {str(name): column.to_numpy() for name, column in path.to_pandas().items()}
         for i, axis in enumerate("enu"):
             table[f"v_{axis}_mps"] = self.velocity_mps[:, i]
-        for i, axis in enumerate("xyz"):
-            table[f"gyro_bias_{axis}_radps"] = self.gyro_bias_radps[:, i]
-            table[f"accel_bias_{axis}_mps2"] = self.accel_bias_mps2[:, i]
-        table["slip"], table["sigma_slip"] = self.slip, self.slip_sigma
-        for i, name in enumerate(self.linear_names):
-            if name != "slip" and self.linear is not None and self.linear_sigma is not None:
-                table[name], table[f"sigma_{name}"] = self.linear[:, i], self.linear_sigma[:, i]
-        for i, name in enumerate(self.classes):
-            table[f"p_{name}"] = self.terrain[:, i]
-        table["terrain"], table["status"] = self.dominant_terrain(), self.status
+        if path.twist_body is not None:
+            table["yaw_rate_radps"] = path.twist_body[:, 5]
+        table |= {"slip": self.slip, "slip_sigma": self.slip_sigma}
+        table["terrain"] = self.dominant_terrain() if self.classes else ""
+        table |= {f"p_{name}": self.terrain[:, i] for i, name in enumerate(self.classes)}
+        if path.covariance is not None:
+            for i, name in enumerate(("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")):
+                table[f"sigma_{name}"] = np.sqrt(path.covariance[:, i, i])
+        biases = np.hstack([self.gyro_bias_radps, self.accel_bias_mps2])
+        for i, bias in enumerate(BIASES):
+            table[bias] = biases[:, i]
+            if self.bias_sigma is not None:
+                table[f"sigma_{bias}"] = self.bias_sigma[:, i]
+        table |= {f"w_{name}": values for name, values in self.weights.items()}
+        table["status"] = self.status
         if self.slipping is not None and self.immobilised is not None:
-            table["slipping"], table["immobilised"] = self.slipping, self.immobilised
-        return table
+            table |= {"slipping": self.slipping, "immobilised": self.immobilised}
+        for i, name in enumerate(self.linear_names):
+            if name == "slip" or self.linear is None or self.linear_sigma is None:
+                continue
+            if np.isfinite(self.linear_sigma[:, i]).any():
+                table |= {name: self.linear[:, i], f"sigma_{name}": self.linear_sigma[:, i]}
+        return pd.DataFrame(table, index=pd.Index(path.t_ns, name="t_ns"))
 
     def dominant_terrain(self) -> NDArray[Any]:
         """The most probable class (N,) at each keyframe."""
         return np.array(self.classes)[self.terrain.argmax(axis=1)]
+
+    def ground(self) -> NDArray[Any]:
+        """The ground (N,) at each keyframe: one that the robot found, else the most probable class."""
+        classes = self.dominant_terrain()
+        if self.found_ground is None:
+            return classes
+        return np.where(self.found_ground != "", self.found_ground, classes)

@@ -31,9 +31,13 @@ class History:
         self.noises: list[SensorNoise] = []
         self.innovations: list[Innovation] = []
         self.changes: list[WeightChange] = []
+        self.found_grounds: list[str] = []
 
-    def add(self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
-        """A keyframe, the sensor noise it was made with, and the changes of weights before it."""
+    def add(
+        self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = (), found_ground: str = ""
+    ) -> None:
+        """A keyframe, the sensor noise it was made with, the changes of weights before it, and its ground."""
+        self.found_grounds.append(found_ground)
         self.states.append(state)
         self.noises.append(noise)
         self.changes.extend(changes)
@@ -90,9 +94,13 @@ class History:
             self.states = [rounded(gnss.open_heading.widened(state)) for state in self.states]
 
     def estimate(
-        self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]
+        self,
+        classes: tuple[str, ...],
+        changes: list[WeightChange],
+        notes: tuple[str, ...],
+        start_ns: int = 0,
     ) -> Estimate:
-        """All keyframes as arrays along time."""
+        """All keyframes as arrays along time, of a recording that began at `start_ns`."""
         states = self.states
 
         def stack(name: str, width: tuple[int, ...] = ()) -> np.ndarray:
@@ -133,4 +141,6 @@ class History:
             linear=stack("linear", (len(LINEAR),)),
             linear_sigma=stack("linear_sigma", (len(LINEAR),)),
             linear_names=LINEAR,
+            start_ns=start_ns,
+            found_ground=np.array(self.found_grounds, dtype=object),
         )

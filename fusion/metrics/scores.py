@@ -15,7 +15,7 @@ Times in seconds count from the start of the recording.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -152,6 +152,19 @@ def as_outage(pair: Any) -> Outage:
             f"{pair!r} is not an outage", remedy="give pairs (start, length) in seconds, as in [(60, 30)]"
         )
     return Outage(start_s, seconds)
+
+
+def as_outages(pairs: Any) -> list[Outage]:
+    """Outages of pairs (start, length) in seconds.
+
+    Raises:
+        ConfigError: no pairs.
+    """
+    if not isinstance(pairs, Iterable):
+        raise ConfigError(
+            f"outages are {pairs!r}", remedy="give pairs (start, length) in seconds, as in [(60, 30)]"
+        )
+    return [as_outage(pair) for pair in pairs]
 
 
 def score(

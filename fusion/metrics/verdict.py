@@ -17,7 +17,7 @@ from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.sensors import NO_SIGMA
 from terrafusion.fusion.estimate.estimate import JUMPED, STATUS, Innovation
 from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
-from terrafusion.fusion.metrics.error_series import known_keyframes
+from terrafusion.fusion.metrics.error_series import MIN_STEP_M, Errors, known_keyframes, travelled_m
 from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.judged_run import (
     DOUBTFUL,
@@ -48,6 +48,10 @@ reckoning is usually no worse."""
 SIGMA_RATIO = 2.0
 """A sigma is called too small if the errors, after allowing for chance, still show it this many times too
 small: a factor that matters to whoever uses it."""
+OUTAGE_NS = 2_000_000_000
+"""A fix this old no longer carries the position, as for the status."""
+FAR_STEP = 6.0
+"""Sigmas of fixes between the corners of their path, whose length their noise would else increase."""
 NIS_95 = 5.991
 """Chi-square quantile of 95 % for 2 degrees of freedom."""
 GATE_NIS = 13.816
@@ -173,8 +177,31 @@ def _five_sigma(run: Run) -> Iterator[Reason]:
     yield (
         value,
         f"the error exceeds five times its own sigma {100.0 * share:.0f} % of the time, up to {off_m:.1f} m "
-        f"at {since_s(run, int(errors.t_ns[worst])):.0f} s: sigma is wrong there; compare vehicle file, IMU "
-        "mounting and stamps with the log (`terrafusion inspect`)",
+        f"at {since_s(run, int(errors.t_ns[worst])):.0f} s: "
+        + (
+            _other_slip(run, errors, worst)
+            or "sigma is wrong there; compare vehicle file, IMU mounting and stamps with the log "
+            "(`terrafusion inspect`)"
+        ),
+    )
+
+
+def _other_slip(run: Run, errors: Errors, worst: int) -> str:
+    """How slip explains at least half of the error at row `worst` after a time without fixes; else ""."""
+    t_ns = errors.t_ns
+    fixes_ns = np.zeros(0, dtype=np.int64) if run.used is None else run.used.t_ns
+    before_ns = fixes_ns[fixes_ns <= t_ns[worst]]
+    if not len(before_ns) or t_ns[worst] - before_ns[-1] < OUTAGE_NS:
+        return ""
+    rows = (t_ns >= before_ns[-1]) & (t_ns <= t_ns[worst])
+    step_m = max(MIN_STEP_M, 0.0 if run.scores.against == "truth" else FAR_STEP * _fix_sigma_m(run.used))
+    moved, ours = (travelled_m(p[rows], step_m)[-1] for p in (errors.reference_m, errors.estimate_m))
+    if abs(ours - moved) < 0.5 * errors.distance_m()[worst]:
+        return ""
+    return (
+        f"without fixes from {since_s(run, int(before_ns[-1])):.0f} s on the robot moved {moved:.1f} m, the "
+        f"estimate {ours:.1f} m: the wheels slipped {'more' if ours > moved else 'less'} than on the ground "
+        "before; drive such ground with fixes, too, and keep what it shows (`replay --grounds`)"
     )
 
 

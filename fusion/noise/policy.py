@@ -157,6 +157,8 @@ def load_policy(path: str | Path | None = None) -> Policy:
     """
     if path is None:
         return _shipped()
+    if not isinstance(path, str | Path):
+        raise ConfigError(f"a {type(path).__name__} is no policy", remedy="give its file, or a Policy")
     path = Path(path)
     content = structure(PolicyFile, read_yaml(path), file=path)
     if "unknown" not in content.classes:

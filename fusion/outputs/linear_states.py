@@ -78,7 +78,7 @@ def learned_rows(numbers: Sequence[NumberAfterDrive]) -> list[dict[str, Any]]:
 def cells(row: Mapping[str, Any]) -> list[str]:
     """A row of `calibration` as text: quantity, value, sigma, prior's sigma, verdict."""
     label, unit, scale = SHOWN[row["state"]]
-    numbers = [f"{row[key] * scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
+    numbers = [f"{row[key] * scale:z.3f}" for key in ("value", "sigma", "prior_sigma")]
     verdict = "observed" if row["observed"] else "not observable on this drive"
     if row.get("corrects"):
         verdict = "observed, corrects the sensor"

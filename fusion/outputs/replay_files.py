@@ -24,7 +24,7 @@ from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers.log_folder import decimal_seconds
 from terrafusion.datasets.writers.tum import write_tum
-from terrafusion.fusion.estimate.estimate import STATUS, Estimate
+from terrafusion.fusion.estimate.estimate import BIASES, STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.metrics.scores import Scores
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
@@ -182,14 +182,13 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     )
     table |= _numbers([f"p_{name}" for name in estimate.classes], estimate.terrain, ".6f")
     table |= _numbers(("sigma_x_m", "sigma_y_m", "sigma_yaw_rad"), sigma[:, [0, 1, 5]], ".6g")
-    table |= _numbers([f"gyro_bias_{a}_radps" for a in "xyz"], estimate.gyro_bias_radps, ".6g")
-    table |= _numbers([f"accel_bias_{a}_mps2" for a in "xyz"], estimate.accel_bias_mps2, ".6g")
+    table |= _numbers(BIASES, np.hstack([estimate.gyro_bias_radps, estimate.accel_bias_mps2]), ".6g")
     for name, values in estimate.weights.items():
         table |= _numbers((f"w_{name}",), np.reshape(values, (n, 1)), ".6g")
     table["status"] = [_one_line(value) for value in estimate.status]
     for name, flags in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
         table[name] = [""] * n if flags is None else [str(int(flag)) for flag in flags]
-    biases = [f"sigma_gyro_bias_{a}_radps" for a in "xyz"] + [f"sigma_accel_bias_{a}_mps2" for a in "xyz"]
+    biases = [f"sigma_{name}" for name in BIASES]
     unknown = np.full((n, 6), np.nan)
     table |= _numbers(biases, unknown if estimate.bias_sigma is None else estimate.bias_sigma, ".6g")
     for state in LINEAR[1:]:

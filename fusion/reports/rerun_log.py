@@ -104,9 +104,9 @@ def _world(log: _Log, result: ReplayResult) -> None:
     path = estimate.trajectory
     log.fixed("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     xyz = np.nan_to_num(path.position_m)
-    label = estimate.dominant_terrain() if estimate.classes else np.full(len(path), "")
+    label = estimate.ground() if estimate.classes else np.full(len(path), "")
     runs = style.runs_of(label)
-    colours = [_rgba(style.colour_of(str(label[first]), style.TERRAIN_COLOURS)) for first, _ in runs]
+    colours = [_rgba(style.terrain_colour(label[first])) for first, _ in runs]
     lines = [xyz[first : last + 1] for first, last in runs]
     log.fixed("world/path", rr.LineStrips3D(lines, colors=colours, radii=0.08))
     rings = ellipses(estimate, ellipse_rows(estimate, recording.start_ns, result.outages))

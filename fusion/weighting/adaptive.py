@@ -56,6 +56,7 @@ class TerrainNoise:
         per_measurement: what the mode makes of single measurements.
         changes: what changed since `take_changes` was last called, the newest `MOST_CHANGES` of it.
         window: the newest window that the detector was given.
+        found_ground: the found ground that the robot is on, "" on a class or on new ground.
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
@@ -89,6 +90,7 @@ class TerrainNoise:
         self._next_ns = self._updated_ns = 0
         self._grade = 0.0
         self._on_found_s: dict[str, float] = {}
+        self.found_ground = ""
         self.window: Window | None = None
         self._last_speed = np.nan
         self._source = "detector"
@@ -212,8 +214,9 @@ class TerrainNoise:
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
             self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
             self._ground_slip.recognise(self.grounds.memory.belief)
+            self.found_ground = ""
             if int(self._probabilities.argmax()) == self._unknown:
-                name = self.grounds.memory.most_probable()
+                self.found_ground = name = self.grounds.memory.most_probable()
                 self._on_found_s[name] = self._on_found_s.get(name, 0.0) + window.dt_s
         self._learn_driven_slip(window)
         self._source = "detector"

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from terrafusion.datasets.core.arguments import checked_names
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.datasets.core.recording import Recording
@@ -82,7 +83,7 @@ def coordinates_of(names: str | Sequence[str], model: Model, priors: Mapping[str
     Raises:
         ConfigError: an unknown name, or a prior of a parameter that is not calibrated.
     """
-    numbers: dict[str, Quantity] = resolve((names,) if isinstance(names, str) else tuple(names), model)
+    numbers: dict[str, Quantity] = resolve(checked_names(names, "parameters"), model)
     for name, prior in priors.items():
         if not isinstance(prior, Prior):
             remedy = "give a Prior(value, sigma) of terrafusion.twin.calibrate.coordinates"

@@ -190,7 +190,7 @@ def _shade_terrain(plot: Plot, estimate: Estimate, t_s: Array) -> None:
     if not style.grounds_known(estimate):
         return
     rows = style.thin(len(t_s), 600)
-    label, t_s = estimate.dominant_terrain()[rows], t_s[rows]
+    label, t_s = estimate.ground()[rows], t_s[rows]
     runs = style.runs_of(label)
     strips: dict[str, list[tuple[float, float]]] = {}
     for first, last in runs:

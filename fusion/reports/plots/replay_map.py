@@ -129,7 +129,7 @@ def _ground(plot: Plot, estimate: Estimate) -> None:
     xy = estimate.trajectory.position_m[rows, :2]
     if len(xy) < 2 or not style.grounds_known(estimate):
         return
-    label = estimate.dominant_terrain()[rows]
+    label = estimate.ground()[rows]
     lines: dict[str, list[Array]] = {}
     for first, last in style.runs_of(label):
         lines.setdefault(str(label[first]), []).append(xy[first : last + 1])

@@ -30,6 +30,8 @@ EXACT_IN_FLOAT32 = 2.0e4
 """Numbers up to this size are sent in single precision: their steps are below 2 mm there."""
 TIME_LABEL_PX = 16
 """Of the label below a figure over time."""
+AXIS_PX = 80
+"""Left of all figures, so that the same time stands at the same place in each."""
 NO_VALUE = "#80808040"
 _OWN_ID = re.compile(r'"id": "(p\d+)"')
 _ID = re.compile(r'"(p\d+)"')
@@ -100,7 +102,10 @@ class Sheet:
         if self.outages:
             edges = np.array([(one.start_s, one.start_s + one.seconds) for one in self.outages])
             at = {"x0": edges[:, 0], "x1": edges[:, 1]}
-            plot.glyph("vstrip", at, "no GNSS", style.OUTAGE_ON_ANY, "area", alpha=0.16, line_width=0)
+            plot.glyph(
+                "vstrip", at, "no GNSS", style.OUTAGE_ON_ANY, "hatch", fill_alpha=0.06, line_width=0,
+                hatch_pattern="right_diagonal_line", hatch_color=style.OUTAGE_ON_ANY, hatch_alpha=0.25,
+            )  # fmt: skip
         return plot
 
     def add_map(self, key: str, x: str, y: str, height: int = 460) -> Plot:
@@ -121,6 +126,7 @@ class Sheet:
         fig.toolbar.logo = None
         fig.title.text_color = style.NEUTRAL
         fig.min_border_right = 4
+        fig.min_border_left = AXIS_PX
         for axis in (fig.xaxis, fig.yaxis):
             axis.axis_label_text_font_style = "normal"
         key = name.split()[-1]

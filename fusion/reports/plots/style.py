@@ -6,6 +6,7 @@ colour blindness can tell apart; terrains that are alike in hue differ in lightn
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -48,7 +49,7 @@ MODE_COLOURS = {
 AXIS_COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Of x, y and z."""
 TRUTH, HELD_OUT, NEUTRAL = "#1a1a1a", "#cc3311", "#7f7f7f"
-TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#e69f00"
+TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#808080"
 """The same where the background may be light or dark."""
 BEFORE, AFTER = "#d55e00", "#0072b2"
 LINE_LUMINANCE = (0.13, 0.29)
@@ -65,7 +66,10 @@ def colour_of(name: str, table: dict[str, str]) -> str:
 
 
 def terrain_colour(name: object) -> str:
-    """The colour of a terrain class."""
+    """The colour of a terrain class, or of a ground that the robot found: "ground 1", "ground 2", ..."""
+    found = re.fullmatch(r"ground (\d+)", str(name))
+    if found:
+        return SPARE_COLOURS[(int(found[1]) - 1) % len(SPARE_COLOURS)]
     return colour_of(str(name), TERRAIN_COLOURS)
 
 
@@ -90,8 +94,8 @@ def label_text(text: object, limit: int = 60) -> str:
 
 
 def grounds_known(estimate: Estimate) -> bool:
-    """Whether a class of the policy is the most probable one of any keyframe."""
-    return bool(estimate.classes) and bool((estimate.dominant_terrain() != UNKNOWN).any())
+    """Whether the ground of any keyframe has a name."""
+    return bool(estimate.classes) and bool((estimate.ground() != UNKNOWN).any())
 
 
 def thin(n: int, most: int = MAX_POINTS, keep: Iterable[int] = ()) -> NDArray[np.int64]:

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import terrafusion as tf
@@ -60,6 +61,14 @@ def test_a_replay_has_metrics_estimate_and_report(result: tf.Replay, tmp_path: P
     table = result.estimate.to_pandas()
     assert len(table) == len(result.estimate.trajectory)
     assert np.array_equal(table["x_m"], result.estimate.trajectory.position_m[:, 0])
+    file = pd.read_csv(page.with_name("estimate.csv"), index_col="t_ns")
+    known = [name for name in file if file[name].notna().any()]
+    assert set(known) <= set(table)
+    for name in known:
+        if file[name].dtype.kind in "if":
+            np.testing.assert_allclose(table[name].astype(float), file[name], rtol=1e-5, atol=1e-6)
+        else:
+            assert list(table[name]) == list(file[name])
 
 
 def test_a_log_may_be_a_path_and_a_vehicle_an_object(

@@ -62,6 +62,9 @@ def test_a_policy_may_be_a_path_as_text(log: tf.Recording, tmp_path: Path) -> No
         ({"outages": [(20, float("nan"))]}, "is not an outage"),
         ({"outages": ["20:10"]}, "'20:10' is not an outage"),
         ({"outages": [(20, 10, 5)]}, "is not an outage"),
+        ({"outages": None}, r"outages are None; give pairs"),
+        ({"policy": 3}, "a int is no policy; give its file"),
+        ({"terrain_model": {}}, "a dict is no terrain model; give the file"),
         ({"lag_s": float("nan")}, "'lag_s' is nan, out of range"),
         ({"lag_s": float("inf")}, "'lag_s' is inf, out of range"),
         ({"lag_s": "5"}, "'lag_s' is '5'; give"),
@@ -79,6 +82,9 @@ def test_a_replay_refuses_wrong_arguments(log: tf.Recording, wrong: dict[str, An
         ({"effects": ["slope"]}, r"effects are \['slope'\]; give"),
         ({"effects": {"slope": None}}, "effect 'slope/uniform' is None, out of range"),
         ({"effects": {"slope": "0.1"}}, "effect 'slope/uniform' is 0.1, out of range"),
+        ({"slope_deg": "5"}, "'slope_deg' is '5'; give a number"),
+        ({"payload_kg": []}, r"'payload_kg' is \[\]; give a number"),
+        ({"terrain": ["mud"]}, r"terrain is \['mud'\]; give the name of one"),
         ({"seed": 1.5}, r"seed 1\.5 is no whole number"),
         ({"seed": "1"}, "seed '1' is no whole number"),
     ],
@@ -103,6 +109,21 @@ def test_one_name_needs_no_list(log: tf.Recording, tmp_path: Path) -> None:
         tf.benchmark(tmp_path, only="mixd")
 
 
+def test_counts_and_names_are_of_their_types(log: tf.Recording, tmp_path: Path) -> None:
+    calls: list[tuple[Any, dict[str, Any], str]] = [
+        (tf.diagnose, {"seed": "x"}, "'seed' is 'x'; give a whole number from 0"),
+        (tf.diagnose, {"significance": None}, "'significance' is None"),
+        (tf.diagnose, {"effects": 3}, "'effects' is 3; give a name, or a list"),
+        (tf.calibrate, {"parameters": 3}, "'parameters' is 3"),
+        (lambda _, **wrong: tf.benchmark(tmp_path, **wrong), {"only": [3]}, r"'only' is \[3\]"),
+        (lambda _, **wrong: tf.benchmark(tmp_path, **wrong), {"seeds": 1.5}, "'seeds' is 1.5"),
+        (lambda _, **wrong: tf.benchmark(tmp_path, **wrong), {"jobs": 0}, "'jobs' is 0; give a whole"),
+    ]
+    for call, wrong, message in calls:
+        with pytest.raises(tf.ConfigError, match=message):
+            call(log, **wrong)
+
+
 def test_a_prior_is_no_number(log: tf.Recording) -> None:
     with pytest.raises(tf.ConfigError, match=r"'vehicle.wheel.radius_m' is 0.17; give a Prior\(value"):
         tf.calibrate(log, parameters="vehicle.wheel.radius_m", priors={"vehicle.wheel.radius_m": 0.17})  # type: ignore[dict-item]
@@ -116,7 +137,7 @@ def test_an_estimator_takes_a_configuration_and_that_a_rig() -> None:
 
 
 def test_a_policy_is_fitted_to_one_drive_at_least(tmp_path: Path) -> None:
-    with pytest.raises(tf.ConfigError, match="0 seeds; give a whole number from 1"):
+    with pytest.raises(tf.ConfigError, match="'seeds' is 0; give a whole number from 1"):
         tf.policy.fit(tmp_path / "policy.yaml", seeds=0)
 
 

@@ -97,6 +97,17 @@ def test_an_error_beyond_five_sigma_is_not_good(drive, offset_m, value):
     assert ("five times its own sigma" in " ".join(found.reasons)) == (value == "doubtful")
 
 
+@pytest.mark.parametrize(("until_s", "slip"), [(20.0, True), (60.0, False)])
+def test_slip_without_fixes_is_named_where_it_explains_the_error(drive, until_s, slip):
+    """The estimate goes on at the speed of the wheels, 0.5 m/s too fast."""
+    d = drive(seconds=60.0, turn_radps=0.0, drift_mps=0.5, drift_from_s=20.0, sigma_m=0.5)
+    used = d.fixes.between(int(d.fixes.t_ns[0]), int(d.fixes.t_ns[0] + until_s * 1e9))
+    found = " ".join(verdict(dataclasses.replace(d, fixes=used)).reasons)
+    assert "five times its own sigma" in found
+    assert ("without fixes from 19 s on the robot moved 41.0 m, the estimate 61.0 m" in found) == slip
+    assert ("the wheels slipped more" in found, "IMU mounting" in found) == (slip, not slip)
+
+
 def test_a_sigma_too_small_is_named(drive):
     d = drive(noise_m=0.35, sigma_m=0.1)
     assert "NEES" in " ".join(verdict(d, estimate=consistent(d)).reasons)
@@ -287,6 +298,7 @@ def test_a_likely_delay_beyond_the_sigma_of_the_position_is_not_good(drive, dela
     found = verdict(d, truth=False, estimate=consistent(d), corrections=corrections)
     assert found.value == value, found
     assert ("the fixes seem 0.30 s" in found.reasons[0].lower()) == (value == "doubtful")
+    assert verdict(d, estimate=consistent(d), corrections=corrections).value == "good", "its errors are small"
 
 
 def places(d, lever_m=(0.0, 0.0, 0.0), late_s=0.0, from_s=20.0):

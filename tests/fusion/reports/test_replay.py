@@ -277,14 +277,25 @@ def test_a_ground_that_nothing_tells_colours_nothing(drive):
     known = np.zeros_like(d.estimate.terrain)
     known[:, CLASSES.index("unknown")] = 1.0
     blank = dataclasses.replace(d.estimate, terrain=known)
+    found = np.where(np.arange(len(known)) < 40, "ground 1", "").astype(object)
     entries = []
-    for estimate in (d.estimate, blank):
+    for estimate in (d.estimate, blank, dataclasses.replace(blank, found_ground=found)):
         sheet = Sheet(20.0, start_ns=d.recording.start_ns)
         plots.plot_slip(sheet, {"a": estimate}, "a", COLOURS)
         plots_map.plot_map(sheet, {"a": estimate}, "a", d.recording, COLOURS, errors={})
         entries.append({label for panel in sheet.panels.values() for label in panel.legend})
     assert "on loose_sand" in entries[0]
     assert not {"unknown", "on unknown"} & entries[1]
+    assert {"ground 1", "on ground 1", "unknown"} <= entries[2]
+
+
+def test_grounds_and_outages_look_different(drive):
+    names = [*style.TERRAIN_COLOURS, *(f"ground {k}" for k in range(1, len(style.SPARE_COLOURS) + 1))]
+    assert len({style.terrain_colour(name) for name in names}) == len(names)
+    d = drive(seconds=60.0)
+    sheet = Sheet(60.0, OUTAGES, d.recording.start_ns)
+    plots.plot_slip(sheet, {"a": d.estimate}, "a", COLOURS)
+    assert [k for k, e in sheet.panels["slip"].legend.items() if e.form == "hatch"] == ["no GNSS"]
 
 
 def test_the_legend_of_the_map_shows_start_and_end_as_the_map_does(drive):

@@ -218,6 +218,14 @@ def test_grounds_are_learned_where_no_model_knows_them_or_a_memory_is_given() ->
         assert len(memory) == 0
 
 
+def test_each_keyframe_tells_which_ground_the_robot_found() -> None:
+    drive = until(tf.simulate("figure_eight", terrain="asphalt", seed=3), 15.0)
+    found = replay(drive, vehicle="husky", findings=())
+    assert found.estimate.found_ground is not None
+    assert {*found.found_shares} == {*found.estimate.found_ground} - {""} != set()
+    assert set(found.estimate.ground()) <= {*found.found_shares, *found.estimate.classes}
+
+
 @pytest.mark.parametrize(("label", "believed"), [("asphalt", True), ("mud", False)])
 def test_a_label_that_wheels_and_imu_contradict_is_not_believed(label: str, believed: bool) -> None:
     """The terrain model knows the robot; a wrong label must not teach the slip of its ground either."""

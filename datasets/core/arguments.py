@@ -1,0 +1,30 @@
+"""Arguments of the public functions: a wrong one is a `ConfigError` that says what to give."""
+
+from collections.abc import Iterable
+from numbers import Integral
+from typing import Any
+
+from terrafusion.datasets.core.errors import ConfigError
+
+
+def checked_names(value: Any, what: str) -> tuple[str, ...]:
+    """One name, or several, as a tuple.
+
+    Raises:
+        ConfigError: neither.
+    """
+    names = (value,) if isinstance(value, str) or not isinstance(value, Iterable) else tuple(value)
+    if not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"'{what}' is {value!r}", remedy="give a name, or a list of names")
+    return names
+
+
+def checked_whole(value: Any, what: str, least: int = 0) -> int:
+    """A whole number from `least` on.
+
+    Raises:
+        ConfigError: anything else.
+    """
+    if not isinstance(value, Integral) or value < least:
+        raise ConfigError(f"'{what}' is {value!r}", remedy=f"give a whole number from {least}")
+    return int(value)
