@@ -74,8 +74,11 @@ class ArrivingJoints:
                 self._angles[k] = t_ns, angle
                 if speeds is None and t_ns > before_ns:
                     speed = (angle - before) / ((t_ns - before_ns) * 1e-9)
-            if np.isfinite(speed) and not (self._held[k] and t_ns <= self._held[k][-1].t_ns):
-                self._held[k].append(_Joint(t_ns, speed, angle))
+            held = self._held[k]
+            if held and held[-1].t_ns - t_ns > LONGEST_GAP_NS:
+                held.clear()  # the clock was set back
+            if np.isfinite(speed) and not (held and t_ns <= held[-1].t_ns):
+                held.append(_Joint(t_ns, speed, angle))
         return self._completed()
 
     def _completed(self) -> list[WheelSample]:

@@ -11,6 +11,10 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import turned_by
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.ros.arriving import LIVE, ArrivingMessages, RawMessage
+from terrafusion.datasets.readers.ros.topics import BagTopic
+from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.datasets.ros_bags import MAKE2, T0, Message, imu_messages, write_ros2
@@ -81,6 +85,27 @@ def test_wheels_in_messages_of_their_own_are_brought_together(
     t_s = (wheels.t_ns - T0) * 1e-9
     np.testing.assert_allclose(wheels.angle_rad, np.outer(t_s, [3.0, 4.0]), atol=1e-9)
     assert any("each in messages of its own: left = " in note for note in recording.notes)
+
+
+def test_wheels_in_messages_of_their_own_arrive_again_after_a_clock_was_set_back() -> None:
+    topic = BagTopic("/left", JOINTS, 1, ("/right",))
+    arriving = ArrivingMessages(Request(LIVE), {"wheels": topic})
+    found = []
+    for begin in (T0, T0 - 60_000_000_000):
+        for i in range(40):
+            t = begin + (i // 2) * 20_000_000 + i % 2 * 5_000_000
+            name = topic.names[i % 2]
+            layout = CdrTemplate().header("").strings(["wheel"]).constant("I", 0)
+            layout.constant("I", 1).constant("d", 2.0 + i % 2).constant("I", 0)
+            cdr = split(layout.stamped(np.array([t])))[0]
+            found += arriving.samples(RawMessage(name, JOINTS, cdr, t))
+    times = np.array([t for t, _, _ in found])
+    assert ((times >= T0).sum(), (times < T0).sum()) == (19, 19)  # not the first, before any on the right
+    for _, kind, sample in found:
+        assert kind == "wheels"
+        assert sample.names == ("left", "right")
+        assert sample.speed.tolist() == [2.0, 3.0]
+        assert sample.angle_rad is None
 
 
 def test_joints_without_numbers_until_the_hardware_answers_are_left_out(tmp_path: Path) -> None:
