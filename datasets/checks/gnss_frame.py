@@ -221,15 +221,35 @@ def reflection(recording: Recording) -> tuple[str, Repair]:
     """What undoes mirrored positions: what the velocities show, else a swap of east and north."""
     fit = velocity_fit(recording.gnss) if recording.gnss is not None else None
     axis = fit.reflection() if fit is not None else None
+    both = axis is None and _velocities_mirrored(recording)
     if axis is None:
-        fix = "swap east and north (assumed: one of them may have the wrong sign instead, turning the map)"
+        fix = "swap east and north" + ", of the velocities, too" * both
+        fix += " (assumed: one of them may have the wrong sign instead, turning the map)"
     elif axis == "swap":
         fix = "swap east and north, as the velocities show"
     else:
         fix = f"change the sign of {axis}, as the velocities show"
-    return fix, changed("gnss", _reflected, swap=axis in (None, "swap"), signs=SIGNS[axis or "swap"])
+    swap = axis in (None, "swap")
+    return fix, changed("gnss", _reflected, swap=swap, signs=SIGNS[axis or "swap"], velocities=both)
 
 
-def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float]) -> Gnss:
+def _velocities_mirrored(recording: Recording) -> bool:
+    """Whether the course of the velocities turns against the gyro, as that of the positions does."""
+    gnss, yaw = recording.gnss, motion.gyro_angle(recording)
+    if gnss is None or yaw is None or gnss.velocity_enu_mps is None:
+        return False
+    known = np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)
+    moved, velocity = gnss.select(known), motion.on_plane(gnss.velocity_enu_mps[known])
+    path = motion.cumulative(motion.seconds(moved.t_ns, recording.start_ns), velocity)
+    enu = np.column_stack([path.real, path.imag, np.zeros(len(path))])
+    moved = dataclasses.replace(moved, enu_m=enu, sigma_enu_m=np.zeros_like(enu))
+    both = motion.course_agreement(yaw, moved, recording.start_ns)
+    return both is not None and both.r < -SURE_R
+
+
+def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float], velocities: bool) -> Gnss:
     enu, sigma = gnss.enu_m[:, _order(swap)] * (*signs, 1.0), gnss.sigma_enu_m[:, _order(swap)]
-    return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma)
+    velocity = gnss.velocity_enu_mps
+    if velocities and velocity is not None:
+        velocity = velocity[:, _order(swap)] * (*signs, 1.0)
+    return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma, velocity_enu_mps=velocity)

@@ -57,6 +57,24 @@ def test_swapped_axes_of_coarse_fixes_are_found_and_mended(coarse: Recording) ->
     np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
 
 
+def test_velocities_that_are_swapped_with_coarse_fixes_are_mended_with_them() -> None:
+    legs = (DriveSegment(3.0), DriveSegment(27.0, 0.8, 0.2), DriveSegment(27.0, 0.8, -0.1))
+    coarse = with_fixes(
+        simulate(Scenario("bends", 57.0, drive=legs, route=(RouteLeg("asphalt"),)), seed=2), 0.3
+    )
+    assert coarse.gnss is not None
+    assert coarse.truth is not None
+    pace = np.gradient(coarse.truth.position_m, coarse.truth.t_ns * 1e-9, axis=0)
+    columns = [np.interp(coarse.gnss.t_ns, coarse.truth.t_ns, pace[:, k]) for k in range(3)]
+    for order in ([0, 1, 2], [1, 0, 2]):  # the velocities are right, or swapped with the positions
+        velocity = np.column_stack(columns)[:, order]
+        gnss = dataclasses.replace(coarse.gnss, velocity_enu_mps=velocity)
+        mended, _ = repair(swapped(dataclasses.replace(coarse, gnss=gnss)), RIG)
+        assert mended.gnss is not None
+        np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
+        np.testing.assert_array_equal(mended.gnss.velocity_enu_mps, np.column_stack(columns))
+
+
 def test_noise_of_single_fixes_does_not_hide_the_image(coarse: Recording) -> None:
     noisy = with_fixes(coarse, 0.6)
     assert "gnss-course" not in codes(noisy)
