@@ -20,6 +20,8 @@ DEGREE_RATIO, RADIAN_RATIO = (6e-6, 5e-5), (1e-7, 9e-7)
 SPEED_UNITS = {"km/h": 3.6, "knots": 1.943844, "miles/h": 2.236936, "cm/s": 100.0, "mm/s": 1000.0}
 UNIT_ERROR, ANGLE_ERROR, SURE_R = 0.1, np.radians(20.0), 0.8
 CHORD_S = (0.5, 10.0)
+CLEARER = 3.0
+"""Ratio of what is left of the positions from which on the path tells latitude from longitude."""
 MOST_SIGMA_M = 10.0
 """No receiver that shows a unit has a larger sigma: it is in the unit of the positions."""
 
@@ -61,9 +63,19 @@ def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tupl
     if yaw is None or metric is None:
         return False, True
     both = motion.course_agreement(yaw, metric, context.recording.start_ns)
-    if both is None or abs(both.r) < SURE_R:
+    if both is not None and abs(both.r) >= SURE_R:
+        return both.r < 0.0, False
+    north, east = (_left_by_path(context, to_degrees, swapped=swapped) for swapped in (False, True))
+    if north is None or east is None:
         return False, True
-    return both.r < 0.0, False
+    return east < north, max(north, east) < CLEARER * min(north, east)
+
+
+def _left_by_path(context: CheckContext, to_degrees: float, *, swapped: bool) -> float | None:
+    """Share of the converted positions' spread that the path of wheels and gyro does not explain."""
+    metric = CheckContext(_to_metres(context.recording, to_degrees, swapped=swapped), context.rig)
+    fits = fit_windows(metric, path_by(metric.recording, "gnss"))
+    return None if fits is None else 1.0 - float(np.average(fits.coherence**2, weights=fits.weight))
 
 
 def _to_metres(recording: Recording, to_degrees: float, *, swapped: bool) -> Recording:
