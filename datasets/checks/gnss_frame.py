@@ -20,6 +20,8 @@ DEGREE_RATIO, RADIAN_RATIO = (6e-6, 5e-5), (1e-7, 9e-7)
 SPEED_UNITS = {"km/h": 3.6, "knots": 1.943844, "miles/h": 2.236936, "cm/s": 100.0, "mm/s": 1000.0}
 UNIT_ERROR, ANGLE_ERROR, SURE_R = 0.1, np.radians(20.0), 0.8
 CHORD_S = (0.5, 10.0)
+CLEARER = 3.0
+"""Ratio of what is left of the positions from which on the path tells latitude from longitude."""
 MOST_SIGMA_M = 10.0
 """No receiver that shows a unit has a larger sigma: it is in the unit of the positions."""
 
@@ -61,9 +63,19 @@ def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tupl
     if yaw is None or metric is None:
         return False, True
     both = motion.course_agreement(yaw, metric, context.recording.start_ns)
-    if both is None or abs(both.r) < SURE_R:
+    if both is not None and abs(both.r) >= SURE_R:
+        return both.r < 0.0, False
+    north, east = (_left_by_path(context, to_degrees, swapped=swapped) for swapped in (False, True))
+    if north is None or east is None:
         return False, True
-    return both.r < 0.0, False
+    return east < north, max(north, east) < CLEARER * min(north, east)
+
+
+def _left_by_path(context: CheckContext, to_degrees: float, *, swapped: bool) -> float | None:
+    """Share of the converted positions' spread that the path of wheels and gyro does not explain."""
+    metric = CheckContext(_to_metres(context.recording, to_degrees, swapped=swapped), context.rig)
+    fits = fit_windows(metric, path_by(metric.recording, "gnss"))
+    return None if fits is None else 1.0 - float(np.average(fits.coherence**2, weights=fits.weight))
 
 
 def _to_metres(recording: Recording, to_degrees: float, *, swapped: bool) -> Recording:
@@ -221,15 +233,35 @@ def reflection(recording: Recording) -> tuple[str, Repair]:
     """What undoes mirrored positions: what the velocities show, else a swap of east and north."""
     fit = velocity_fit(recording.gnss) if recording.gnss is not None else None
     axis = fit.reflection() if fit is not None else None
+    both = axis is None and _velocities_mirrored(recording)
     if axis is None:
-        fix = "swap east and north (assumed: one of them may have the wrong sign instead, turning the map)"
+        fix = "swap east and north" + ", of the velocities, too" * both
+        fix += " (assumed: one of them may have the wrong sign instead, turning the map)"
     elif axis == "swap":
         fix = "swap east and north, as the velocities show"
     else:
         fix = f"change the sign of {axis}, as the velocities show"
-    return fix, changed("gnss", _reflected, swap=axis in (None, "swap"), signs=SIGNS[axis or "swap"])
+    swap = axis in (None, "swap")
+    return fix, changed("gnss", _reflected, swap=swap, signs=SIGNS[axis or "swap"], velocities=both)
 
 
-def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float]) -> Gnss:
+def _velocities_mirrored(recording: Recording) -> bool:
+    """Whether the course of the velocities turns against the gyro, as that of the positions does."""
+    gnss, yaw = recording.gnss, motion.gyro_angle(recording)
+    if gnss is None or yaw is None or gnss.velocity_enu_mps is None:
+        return False
+    known = np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)
+    moved, velocity = gnss.select(known), motion.on_plane(gnss.velocity_enu_mps[known])
+    path = motion.cumulative(motion.seconds(moved.t_ns, recording.start_ns), velocity)
+    enu = np.column_stack([path.real, path.imag, np.zeros(len(path))])
+    moved = dataclasses.replace(moved, enu_m=enu, sigma_enu_m=np.zeros_like(enu))
+    both = motion.course_agreement(yaw, moved, recording.start_ns)
+    return both is not None and both.r < -SURE_R
+
+
+def _reflected(gnss: Gnss, swap: bool, signs: tuple[float, float], velocities: bool) -> Gnss:
     enu, sigma = gnss.enu_m[:, _order(swap)] * (*signs, 1.0), gnss.sigma_enu_m[:, _order(swap)]
-    return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma)
+    velocity = gnss.velocity_enu_mps
+    if velocities and velocity is not None:
+        velocity = velocity[:, _order(swap)] * (*signs, 1.0)
+    return dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma, velocity_enu_mps=velocity)

@@ -110,11 +110,13 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
     if mean is None or is_metric(mean):
         return
     size = float(np.linalg.norm(mean))
-    if 0.85 < size < 1.15:
-        what, fix = "acceleration looks like g, not m/s2", f"multiply by {GRAVITY_MPS2}"
-        repair = scaled("imu", GRAVITY_MPS2, "accel_mps2")
-        yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
-        return
+    for unit, in_g in (("g", 1.0), ("mg", 1000.0)):
+        if 0.85 < size / in_g < 1.15:
+            factor = GRAVITY_MPS2 / in_g
+            what, fix = f"acceleration looks like {unit}, not m/s2", f"multiply by {factor:.7g}"
+            repair = scaled("imu", factor, "accel_mps2")
+            yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
+            return
     what = f"mean specific force is {size:.2f} m/s2, not 9.8"
     fix, emptied = "give raw accelerometer data in m/s2, gravity included", None
     if size < REMOVED_SHARE * GRAVITY_MPS2:

@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -55,6 +56,37 @@ def test_swapped_axes_of_coarse_fixes_are_found_and_mended(coarse: Recording) ->
     assert mended.gnss is not None
     assert coarse.gnss is not None
     np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
+
+
+def test_velocities_that_are_swapped_with_coarse_fixes_are_mended_with_them() -> None:
+    legs = (DriveSegment(3.0), DriveSegment(27.0, 0.8, 0.2), DriveSegment(27.0, 0.8, -0.1))
+    coarse = with_fixes(
+        simulate(Scenario("bends", 57.0, drive=legs, route=(RouteLeg("asphalt"),)), seed=2), 0.3
+    )
+    assert coarse.gnss is not None
+    assert coarse.truth is not None
+    pace = np.gradient(coarse.truth.position_m, coarse.truth.t_ns * 1e-9, axis=0)
+    columns = [np.interp(coarse.gnss.t_ns, coarse.truth.t_ns, pace[:, k]) for k in range(3)]
+    for order in ([0, 1, 2], [1, 0, 2]):  # the velocities are right, or swapped with the positions
+        velocity = np.column_stack(columns)[:, order]
+        gnss = dataclasses.replace(coarse.gnss, velocity_enu_mps=velocity)
+        mended, _ = repair(swapped(dataclasses.replace(coarse, gnss=gnss)), RIG)
+        assert mended.gnss is not None
+        np.testing.assert_allclose(mended.gnss.enu_m, coarse.gnss.enu_m)
+        np.testing.assert_array_equal(mended.gnss.velocity_enu_mps, np.column_stack(columns))
+
+
+def test_the_path_tells_latitude_from_longitude_where_courses_do_not() -> None:
+    legs = (DriveSegment(3.0), DriveSegment(40.0, 0.8, 0.3))  # one circle: its turn rate is constant
+    log = simulate(Scenario("circle", 43.0, drive=legs, route=(RouteLeg("asphalt"),)), seed=2)
+    log = dataclasses.replace(log, truth=None, command=None, datum=None)
+    assert log.gnss is not None
+    degrees = enu_to_geodetic(log.gnss.enu_m, (48.0, 11.0, 500.0))
+    first = dataclasses.replace(log.gnss, enu_m=degrees)  # latitude in the column of east
+    mended, _ = repair(dataclasses.replace(log, gnss=first), RIG)
+    assert mended.gnss is not None
+    away = log.gnss.enu_m - log.gnss.enu_m[0]
+    np.testing.assert_allclose((mended.gnss.enu_m - mended.gnss.enu_m[0])[:, :2], away[:, :2], atol=0.01)
 
 
 def test_noise_of_single_fixes_does_not_hide_the_image(coarse: Recording) -> None:

@@ -219,6 +219,7 @@ def untold(fault: Fault, *channels: str) -> Fault:
 
 
 MENDED: dict[str, tuple[Fault, str, str]] = {
+    "accel in mg": (imu_with(accel_mps2=scaled(1e3 / 9.80665)), "accel-in-g", "error"),
     "accel in g": (imu_with(accel_mps2=scaled(1 / 9.80665)), "accel-in-g", "error"),
     "forward, right, down": (mounted("+x", "-y", "-z"), "imu-axes", "error"),
     "husky": (mounted("-z", "-x", "+y"), "imu-axes", "error"),
