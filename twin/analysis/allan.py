@@ -18,6 +18,10 @@ REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
 ABSENT = "not in the log, or with gaps"
+GAP = 5.0
+"""A step between samples that is so many times the usual one is a gap."""
+TURNING, DRIVEN_SHARE = 0.05, 0.01
+"""Wheels faster than the first (rad/s, or m/s), for more than this share of the time: the robot drives."""
 LEAST_S = 10.0 * LONG_S
 """Shorter series have too few long clusters for the bias parameters."""
 
@@ -161,12 +165,17 @@ def vehicle_at_rest(vehicle: str, hours: float = 2.0, seeds: int = 4) -> ImuAtRe
 
 
 def recording_at_rest(recording: Recording) -> ImuAtRest:
-    """A recorded IMU, which should be at rest.
+    """A recorded IMU, which should be at rest, in its longest stretch without a gap.
 
     Raises:
         DataError: no IMU, or too short a log.
     """
     imu = recording.imu
+    if imu is not None and len(imu) > 2:
+        steps = np.diff(imu.t_ns)
+        edges = np.r_[0, np.flatnonzero(steps > GAP * np.median(steps)) + 1, len(imu)]
+        longest = int(np.argmax(np.diff(edges)))
+        imu = imu.select(np.arange(edges[longest], edges[longest + 1]))
     seconds = 0.0 if imu is None or len(imu) < 2 else float(imu.t_ns[-1] - imu.t_ns[0]) * 1e-9
     if imu is None or seconds < LEAST_S:
         raise DataError(
@@ -179,6 +188,12 @@ def recording_at_rest(recording: Recording) -> ImuAtRest:
         axes = [column[np.isfinite(column)] for column in values.T]
         curves[name] = [allan_deviation(column, rate_hz, 1) for column in axes if len(column) == len(imu)]
     title = f"{recording.name}: IMU, {seconds:.0f} s at {rate_hz:.1f} Hz, mean of the axes"
+    if (wheels := recording.wheels) is not None:
+        during = (wheels.t_ns >= imu.t_ns[0]) & (wheels.t_ns <= imu.t_ns[-1])
+        turning = np.abs(wheels.speed[during]).max(axis=1, initial=0.0) > TURNING
+        share = float(turning.sum()) / max(len(turning), 1)
+        if share > DRIVEN_SHARE:
+            title += f"; the wheels turn in {100.0 * share:.0f} % of it: this is no noise at rest"
     return ImuAtRest(title, curves)
 
 

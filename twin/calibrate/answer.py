@@ -136,8 +136,9 @@ def _assumptions(problem: Problem) -> list[str]:
     notes = [
         f"all logs were driven on {plane} with a payload of {model.payload_kg:g} kg",
         "everything that was not calibrated is as the vehicle's and the soils' files say",
-        "commands were limited in acceleration as the vehicle's file says",
     ]
+    if not all(log.follows for log in problem.logs):
+        notes.append("commands were limited in acceleration as the vehicle's file says")
     if any(o.correlation is not None for log in problem.logs for o in log.observed):
         notes.append("GNSS position errors drift with the time constant of the receiver's data sheet")
     if problem.robust:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
-from terrafusion.twin.analysis.allan import ImuAtRest, allan_deviation, expected_deviation, inertial_noise
+from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.analysis.allan import (
+    ImuAtRest,
+    allan_deviation,
+    expected_deviation,
+    inertial_noise,
+    recording_at_rest,
+)
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
 from terrafusion.twin.sensors.noise import NoiseStreams, flicker, white_and_walk
@@ -80,6 +89,24 @@ def test_the_simulated_imu_has_the_noise_of_its_data_sheet() -> None:
 def test_too_short_a_series_is_refused() -> None:
     with pytest.raises(ValueError, match="9 values are too few"):
         allan_deviation(np.zeros(9), RATE_HZ)
+
+
+def test_a_recorded_imu_is_taken_between_gaps_and_a_drive_is_said() -> None:
+    count = 20_000
+    t_ns = (np.arange(count) * 10_000_000).astype(np.int64)
+    t_ns[count // 4 :] += 300 * 10**9  # a logger that paused
+    noise = white(count, 3, 1e-3)
+    log = Recording("parked", 0, imu=Imu(t_ns, noise, noise), wheels=wheels_at(t_ns, 0.0))
+    rest = recording_at_rest(log)
+    assert "150 s at 100.0 Hz" in rest.title
+    assert "wheels" not in rest.title
+    assert inertial_noise(rest.curves["gyro"]).density == pytest.approx(1e-3, rel=0.05)
+    driven = recording_at_rest(dataclasses.replace(log, wheels=wheels_at(t_ns, 3.0)))
+    assert "the wheels turn in 100 % of it: this is no noise at rest" in driven.title
+
+
+def wheels_at(t_ns: np.ndarray, speed: float) -> Wheels:
+    return Wheels(t_ns, np.full((len(t_ns), 2), speed), ("left", "right"), "radps")
 
 
 def test_text_and_json_tell_the_same_numbers() -> None:

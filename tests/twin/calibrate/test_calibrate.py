@@ -191,6 +191,7 @@ def test_driven_by_measured_wheels() -> None:
         assert found[name].value == pytest.approx(TRUTH[name], rel=0.02, abs=4.0 * found[name].sigma)
     assert not any(c.channel.startswith("wheel") for c in found.channels)
     assert any("measured wheel speeds" in note for note in found.notes)
+    assert not any(note.startswith("commands were limited") for note in found.notes)
     with pytest.raises(DataError, match="cannot be identified"):
         calibrate(drive(), "elevate", SOIL, ("vehicle.drive.lag_s",), source="wheels")
 
