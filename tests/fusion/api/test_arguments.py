@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -134,6 +134,13 @@ def test_an_estimator_takes_a_configuration_and_that_a_rig() -> None:
         tf.Estimator("husky")  # type: ignore[arg-type]
     with pytest.raises(tf.ConfigError, match=r"a VehicleParams is no rig; give Vehicle\.load"):
         tf.EstimatorConfig(tf.Vehicle.load("husky"))  # type: ignore[arg-type]
+
+
+def test_types_allow_the_times_that_the_estimator_takes() -> None:
+    takes_time = [getattr(tf.Estimator, name) for name in dir(tf.Estimator) if name.startswith("add_")]
+    kinds = [get_args(get_type_hints(function)["t_ns"]) for function in takes_time]
+    assert len(kinds) == 8
+    assert all(set(kind) == {int, np.integer, np.datetime64} for kind in kinds)
 
 
 def test_a_policy_is_fitted_to_one_drive_at_least(tmp_path: Path) -> None:
