@@ -12,6 +12,8 @@ Complex = NDArray[np.complex128]
 """Array of complex numbers, such as positions east + i north."""
 TimesNs = NDArray[np.int64]
 """Times in nanoseconds."""
+Stamp = int | np.integer | np.datetime64
+"""A time as callers give it: whole nanoseconds, or a datetime64."""
 Mask = NDArray[np.bool_]
 """Array of truth values."""
 

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Stamp
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import ImuSample, Message
@@ -153,7 +153,7 @@ class Estimator:
         method, arguments = read
         getattr(self, method)(message.t_ns, *arguments)
 
-    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
+    def add_imu(self, t_ns: Stamp, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
         """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.
 
         Where `config.inputs` declares no more than gyro z, all but the yaw rate may be NaN.
@@ -168,7 +168,7 @@ class Estimator:
 
     def add_wheels(
         self,
-        t_ns: int,
+        t_ns: Stamp,
         left_mps: float,
         right_mps: float,
         left_m: float | None = None,
@@ -182,13 +182,13 @@ class Estimator:
             self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m, steering), UNKNOWN)
             self._advance()
 
-    def add_steering(self, t_ns: int, front_rad: float, rear_rad: float = 0.0) -> None:
+    def add_steering(self, t_ns: Stamp, front_rad: float, rear_rad: float = 0.0) -> None:
         """Mean angle of the front and of the rear wheels, rad, positive to the left; of a steered robot."""
         self.steering.add(t_ns, front_rad, rear_rad)
 
     def add_gnss(
         self,
-        t_ns: int,
+        t_ns: Stamp,
         enu_m: ArrayLike,
         sigma_m: ArrayLike | None,
         velocity_mps: ArrayLike | None = None,
@@ -216,22 +216,22 @@ class Estimator:
         """
         self._search.known = checked_start(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
-    def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
+    def add_terrain(self, t_ns: Stamp, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with those of the detector."""
         if (t := self.newest.admitted(t_ns, "terrain")) is not None:
             self.weights.external(t, probabilities)
 
-    def add_command(self, t_ns: int, v_mps: float) -> None:
+    def add_command(self, t_ns: Stamp, v_mps: float) -> None:
         """Commanded forward speed; it distinguishes a stalled robot from a waiting one."""
         if (t := self.newest.admitted(t_ns, "command")) is not None:
             self.monitor.command(t, as_number(v_mps, "speed", "command"))
 
-    def add_pressure(self, t_ns: int, pressure_pa: float) -> None:
+    def add_pressure(self, t_ns: Stamp, pressure_pa: float) -> None:
         """Static pressure of a barometer, Pa; it holds the height of GNSS or of the start."""
         if (t := self.newest.admitted(t_ns, "barometer")) is not None:
             self.aids.height.add(t, as_number(pressure_pa, "pressure", "barometer"))
 
-    def add_magnetic_field(self, t_ns: int, field_t: ArrayLike) -> None:
+    def add_magnetic_field(self, t_ns: Stamp, field_t: ArrayLike) -> None:
         """Magnetic flux density (3,), body axes, tesla; see `magnetometer`."""
         if (t := self.newest.admitted(t_ns, "magnetometer")) is not None:
             self.aids.heading.add(t, as_numbers(field_t, "field", "magnetometer"))

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Stamp
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import SensorConfig, yaw_factor
 from terrafusion.fusion.graph.chain import Chain
@@ -46,7 +46,7 @@ class StuckGyro:
         self._since_ns = 0
         self._count = 0
 
-    def checked(self, t_ns: int, gyro_radps: ArrayLike, wheels: WheelStream) -> Array:
+    def checked(self, t_ns: Stamp, gyro_radps: ArrayLike, wheels: WheelStream) -> Array:
         """A reading (3,), its yaw rate that of the wheels where the gyro is stuck.
 
         Raises:

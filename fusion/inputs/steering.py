@@ -3,6 +3,7 @@
 import bisect
 import math
 
+from terrafusion.datasets.core.arrays import Stamp
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.inputs.sample_stream import SampleStream
 from terrafusion.fusion.inputs.time_jumps import Newest
@@ -28,7 +29,7 @@ class SteeringStream(SampleStream):
         self.course: list[float] = []
         self._wheelbase_m, self._by_rear = rig.wheelbase_m, rig.ahead_m > 0.0
 
-    def add(self, t_ns: int, front_rad: float, rear_rad: float = 0.0) -> None:
+    def add(self, t_ns: Stamp, front_rad: float, rear_rad: float = 0.0) -> None:
         """Mean angle of the front and of the rear wheels, rad, positive to the left.
 
         Raises:

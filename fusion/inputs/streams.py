@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Stamp
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
@@ -136,7 +136,7 @@ class ImuStream(SampleStream):
                 remedy=DECLARE,
             )
 
-    def add(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
+    def add(self, t_ns: Stamp, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
         """A sample: rates (3,) and specific forces (3,).
 
         Raises:
@@ -287,7 +287,7 @@ class WheelStream(SampleStream):
 
     def add(
         self,
-        t_ns: int,
+        t_ns: Stamp,
         left_mps: float,
         right_mps: float,
         left_m: float | None = None,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.arrays import Array, Stamp
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS
@@ -109,7 +109,7 @@ def beyond(reading: Array, limit: float) -> bool:
 
 
 def checked_fix(
-    t_ns: int,
+    t_ns: Stamp,
     enu_m: ArrayLike,
     sigma_m: ArrayLike | None,
     velocity_mps: ArrayLike | None,

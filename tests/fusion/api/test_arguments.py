@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ import terrafusion as tf
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.readers.logs import opened
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.assumptions import assumptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
 from terrafusion.fusion.grounds.memory import GroundMemory
@@ -134,6 +135,21 @@ def test_an_estimator_takes_a_configuration_and_that_a_rig() -> None:
         tf.Estimator("husky")  # type: ignore[arg-type]
     with pytest.raises(tf.ConfigError, match=r"a VehicleParams is no rig; give Vehicle\.load"):
         tf.EstimatorConfig(tf.Vehicle.load("husky"))  # type: ignore[arg-type]
+
+
+def test_types_allow_the_times_that_the_estimator_takes() -> None:
+    takes_time = [getattr(tf.Estimator, name) for name in dir(tf.Estimator) if name.startswith("add_")]
+    kinds = [get_args(get_type_hints(function)["t_ns"]) for function in takes_time]
+    assert len(kinds) == 8
+    assert all(set(kind) == {int, np.integer, np.datetime64} for kind in kinds)
+
+
+def test_an_imu_without_samples_is_none(log: tf.Recording) -> None:
+    assert log.imu is not None
+    short = until(log, 10.0)
+    silent = dataclasses.replace(short, imu=log.imu.select(np.zeros(len(log.imu), dtype=bool)))
+    estimates = [tf.replay(dataclasses.replace(silent, imu=imu)).estimate for imu in (silent.imu, None)]
+    assert np.array_equal(*(one.trajectory.position_m for one in estimates))
 
 
 def test_a_policy_is_fitted_to_one_drive_at_least(tmp_path: Path) -> None:
