@@ -8,6 +8,7 @@ robot:
   gnss_delay_s: {value: 0.21, known: calibrated, sigma: 0.01, logs: [monday, tuesday]}
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -18,11 +19,19 @@ KNOWN = ("measured", "data_sheet", "calibrated", "assumed")
 """How a number is known; what is assumed gets a wide prior and is estimated while driving."""
 LENGTH_SIGMA_M = {"measured": 0.02, "data_sheet": 0.05}
 """1 sigma of a length with a tape, and from a drawing of the robot (assumed)."""
+ANTENNA_SIGMA_M = 0.25
+"""1 sigma of an antenna somewhere on a small robot (assumed)."""
 DRIVES = ("differential", "skid_steer", "tracked", "ackermann", "four_wheel_steer")
 """How a robot turns: two driven wheels and casters, wheels or tracks that skid, steered front wheels,
 steered front and rear wheels."""
 SKIDDING = ("skid_steer", "tracked")
 """Those whose wheels or tracks skid in every turn."""
+
+
+def antenna_spread_m(wheelbase_m: float) -> float:
+    """1 sigma of an antenna that sits anywhere between the axles, from their middle; no less than that of a
+    small robot."""
+    return max(ANTENNA_SIGMA_M, wheelbase_m / math.sqrt(12.0))
 
 
 @dataclass(frozen=True)

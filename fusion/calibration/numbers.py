@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erfcx
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.robot import LENGTH_SIGMA_M, KnownNumber, SensorNumbers
+from terrafusion.datasets.core.robot import LENGTH_SIGMA_M, KnownNumber, SensorNumbers, antenna_spread_m
 
 NUMBERS = (
     "turn_scale",
@@ -46,8 +46,6 @@ LEAST_BIAS_SIGMA_RADPS = 0.005
 """Least prior of the gyro's bias: data sheets give it at one temperature."""
 WHEEL_SCALE_SIGMA = 0.05
 """Tyre pressure, wear, a nominal radius, and the mean slip of the ground (assumed)."""
-ANTENNA_SIGMA_M = 0.25
-"""An antenna somewhere on a robot (assumed)."""
 GNSS_DELAY_SIGMA_S = 0.5
 """Receivers without a common clock report up to seconds late (assumed)."""
 SKIDDING_WHEEL_SIGMA_S, ROLLING_WHEEL_SIGMA_S = 0.2, 0.05
@@ -154,7 +152,12 @@ class Knowledge:
 
 
 def assumed(
-    bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float, slip_time_s: float, skids: bool = False
+    bias_sigma_radps: float,
+    yaw_of_wheels: bool,
+    slip_spread: float,
+    slip_time_s: float,
+    skids: bool = False,
+    wheelbase_m: float = 0.0,
 ) -> Knowledge:
     """What is known of a robot before it drives; `skids`: its wheels or tracks skid in every turn."""
     sigma = np.array(
@@ -162,8 +165,8 @@ def assumed(
             (SKID_TURN_SIGMA if skids else ROLL_TURN_SIGMA) if yaw_of_wheels else GYRO_SCALE_SIGMA,
             max(bias_sigma_radps, LEAST_BIAS_SIGMA_RADPS),
             WHEEL_SCALE_SIGMA,
-            ANTENNA_SIGMA_M,
-            ANTENNA_SIGMA_M,
+            antenna_spread_m(wheelbase_m),
+            antenna_spread_m(wheelbase_m),
             GNSS_DELAY_SIGMA_S,
             SKIDDING_WHEEL_SIGMA_S if skids else ROLLING_WHEEL_SIGMA_S,
             SKIDDING_LAG_SIGMA_S if skids else ROLLING_LAG_SIGMA_S,
@@ -192,9 +195,9 @@ def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
     return dataclasses.replace(wide, mean=mean, covariance=np.diag(sigma**2))
 
 
-def antenna_sigma_m(known: SensorNumbers) -> tuple[float, float]:
+def antenna_sigma_m(known: SensorNumbers, wheelbase_m: float) -> tuple[float, float]:
     """1 sigma of the antenna's place, forward and to the left, before the robot drives."""
-    wide = assumed(0.0, yaw_of_wheels=False, slip_spread=0.0, slip_time_s=1.0)
+    wide = assumed(0.0, yaw_of_wheels=False, slip_spread=0.0, slip_time_s=1.0, wheelbase_m=wheelbase_m)
     sigma = known_before(known, wide, "gyro").sigma
     return float(sigma[ANTENNA_X]), float(sigma[ANTENNA_Y])
 

@@ -218,7 +218,7 @@ def summary(result: ReplayResult) -> list[str]:
                 f"outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: median error "
                 f"{outage.median_m:.2f} m, {outage.end_error_m:.2f} m after {outage.distance_m:.0f} m"
             )
-    for what, value, sigma, _, verdict in map(cells, calibration(result.estimate, result.vehicle.robot)):
+    for what, value, sigma, _, verdict in map(cells, calibration(result.estimate, result.vehicle.rig())):
         lines.append(f"{what}: {value} +- {sigma} ({verdict})")
     corrections = [row for row in learned_rows(result.learned) if row["corrects"]]
     for what, value, sigma, *_ in map(cells, corrections):

@@ -11,6 +11,7 @@ import numpy as np
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import antenna_spread_m
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M, ASSUMED_VELOCITY_SIGMA_MPS, STEERED_DRIVES
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.twin.model.vehicle import VehicleParams, vehicle_names
@@ -103,7 +104,8 @@ def _of_the_vehicle(
             continue
         if _is_assumed(sources, number.section) or (shipped and name in OWN_PLACES):
             value = functools.reduce(getattr, number.section, vehicle)
-            yield Assumption(name, value, number.sigma, number.unit)
+            size_m = antenna_spread_m(vehicle.body.wheelbase_m) if name == "antenna_m" else 0.0
+            yield Assumption(name, value, round(max(number.sigma, size_m), 2), number.unit)
     bias = ("sensors", "imu", "gyro_bias_sigma_radps")
     if inputs.imu != "none" and vehicle.robot.gyro_bias_radps is None and _is_assumed(sources, bias):
         sigma = vehicle.sensors.imu.gyro_bias_sigma_radps

@@ -306,7 +306,8 @@ def prior_of(config: EstimatorConfig) -> Knowledge:
     yaw, bias_sigma = config.inputs.yaw, config.rig.sensors.imu.gyro_bias_sigma_radps
     slip_time_s = SLIP_STEADY * config.policy.fixed.slip_time_s
     skids = config.rig.drive in SKIDDING
-    wide = assumed(bias_sigma, yaw in ("wheels", "steering"), SLIP_SPREAD, slip_time_s, skids)
+    steered_or_wheels = yaw in ("wheels", "steering")
+    wide = assumed(bias_sigma, steered_or_wheels, SLIP_SPREAD, slip_time_s, skids, config.rig.wheelbase_m)
     return known_before(config.rig.known, wide, yaw)
 
 

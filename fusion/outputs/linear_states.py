@@ -8,6 +8,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.robot import SensorNumbers
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.calibration.numbers import antenna_sigma_m
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
@@ -47,13 +48,14 @@ def series(estimate: Estimate, name: str) -> tuple[Array, Array] | None:
     return (estimate.linear[:, i], sigma) if np.isfinite(sigma).any() else None
 
 
-def calibration(estimate: Estimate, known: SensorNumbers | None = None) -> list[dict[str, Any]]:
+def calibration(estimate: Estimate, rig: Rig | None = None) -> list[dict[str, Any]]:
     """What the last keyframe knows of each state of a calibration; empty where none was estimated.
 
     Rows of `state`, `value`, `sigma`, `prior_sigma` (SI, as the name says) and `observed`: sigma is less
-    than `OBSERVED_SHARE` of the prior's. `known` is of the robot; None: nothing.
+    than `OBSERVED_SHARE` of the prior's. `rig` is the robot; None: nothing is known of it.
     """
-    antenna = zip(("antenna_x_m", "antenna_y_m"), antenna_sigma_m(known or SensorNumbers()), strict=True)
+    known, wheelbase_m = (SensorNumbers(), 0.0) if rig is None else (rig.known, rig.wheelbase_m)
+    antenna = zip(("antenna_x_m", "antenna_y_m"), antenna_sigma_m(known, wheelbase_m), strict=True)
     prior = CALIBRATION_SIGMA | dict(antenna)
     found = {name: series(estimate, name) for name in CALIBRATION}
     return [

@@ -62,7 +62,7 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
         **_scored(scores),
         "calibration": [
             finite(row)
-            for row in calibration_of(estimate, result.vehicle.robot) or learned_rows(result.learned)
+            for row in calibration_of(estimate, result.vehicle.rig()) or learned_rows(result.learned)
         ],
         "status": final_status(estimate),
         "notes": [*estimate.notes, *(note for note in scores.notes if note not in estimate.notes)],

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.robot import ANTENNA_SIGMA_M
 from terrafusion.fusion.calibration.numbers import (
-    ANTENNA_SIGMA_M,
     ANTENNA_X,
     ANTENNA_Y,
     GNSS_DELAY,

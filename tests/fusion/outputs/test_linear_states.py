@@ -14,8 +14,8 @@ from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
 from terrafusion.datasets.core.json_text import to_json
+from terrafusion.datasets.core.robot import ANTENNA_SIGMA_M
 from terrafusion.datasets.writers.log_folder import write_log_folder
-from terrafusion.fusion.calibration.numbers import ANTENNA_SIGMA_M
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
