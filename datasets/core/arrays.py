@@ -26,6 +26,15 @@ class TimeRows:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    def __repr__(self) -> str:
+        seconds = float((self.t_ns[-1:] - self.t_ns[:1]).sum()) * 1e-9
+        fields = [
+            f"{name} {value.shape}" if isinstance(value, np.ndarray) else f"{name} {value!r}"
+            for name, value in vars(self).items()
+            if value is not None
+        ]
+        return f"{type(self).__name__}: {len(self)} rows over {seconds:.1f} s; {', '.join(fields)}"
+
     def select(self, rows: Any) -> Self:
         """The same with the rows of a boolean mask, slice or index array."""
         changed = {name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray)}

@@ -37,7 +37,7 @@ class Fix(IntEnum):
     FIXED = 4
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Channel(TimeRows):
     """What all channels share: a clock and rows."""
 
@@ -100,7 +100,7 @@ def _cells(values: Any) -> Iterable[Any]:
     return values.tolist() if values.ndim == 1 else values
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Command(Channel):
     """Commanded body twist: `v_mps` (N,), `yaw_rate_radps` (N,)."""
 
@@ -114,7 +114,7 @@ class Command(Channel):
     yaw_rate_radps: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Wheels(Channel):
     """Wheel speeds `speed` (N, k) of the wheels or sides `names` in `unit` "radps" or "mps".
 
@@ -159,7 +159,7 @@ class Wheels(Channel):
         return messages.sides(self.speed * (wheel_radius_m if self.unit == "radps" else 1.0), self.names)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Imu(Channel):
     """Angular rate `gyro_radps` (N, 3) and specific force `accel_mps2` (N, 3), body axes.
 
@@ -186,7 +186,7 @@ class Imu(Channel):
         return not np.isnan(self.accel_mps2).all(axis=0).any()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gnss(Channel):
     """Antenna position `enu_m` (N, 3) about the recording's datum with 1-sigma `sigma_enu_m` (N, 3).
 
@@ -225,7 +225,7 @@ class Gnss(Channel):
         return dataclasses.replace(self, sigma_v_mps=np.full(len(self), np.nan)).samples()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motor(Channel):
     """Motor currents `current_a` (N, 2) left and right, and voltages `voltage_v` (N, 2) where known."""
 
@@ -239,7 +239,7 @@ class Motor(Channel):
     voltage_v: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Steering(Channel):
     """Steering angles `angle_rad` (N, k) of `names`, rad, positive to the left.
 
@@ -277,7 +277,7 @@ class Steering(Channel):
         return messages.axles(self.angle_rad, self.names, steering_ratio)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Barometer(Channel):
     """Static pressure `pressure_pa` (N,), as measured.
 
@@ -290,7 +290,7 @@ class Barometer(Channel):
     pressure_pa: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Magnetometer(Channel):
     """Magnetic flux density `field_t` (N, 3), body axes, tesla; at the robot."""
 
@@ -304,7 +304,7 @@ class Magnetometer(Channel):
         self._check_width("field_t", 3)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Terrain(Channel):
     """Terrain `label` (N,) of str, and `probabilities` (N, k) over `classes` where known.
 

@@ -1,7 +1,7 @@
 """Wrong usage of the command line, as one line with the nearest match."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import typer
@@ -28,7 +28,20 @@ class CommandGroup(TyperGroup):
             names = self.list_commands(ctx)
             meant = nearest(name, names) or f": one of {', '.join(names)}"
             ctx.fail(f"there is no command '{name}'{meant}")
+        if (stray := behind_reference(args)) is not None:
+            ctx.fail(
+                f"'{stray}' behind --reference may be a run or a reference: write --reference before each "
+                "reference, and the runs first"
+            )
         return super().resolve_command(ctx, args)
+
+
+def behind_reference(args: Sequence[str]) -> str | None:
+    """A word behind the value of `--reference` after runs, as by `--reference may/*`; None where none is."""
+    if len(args) < 2 or args[0] != "gap" or args[1].startswith("-"):
+        return None
+    behind = (args[i + 2] for i, word in enumerate(args[:-2]) if word == "--reference")
+    return next((word for word in behind if not word.startswith("-")), None)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

@@ -111,7 +111,7 @@ def plot_parameters(sheet: Sheet, calibration: Calibration) -> None:
     """Each parameter in prior sigmas about its prior, with two sigma; hollow where not identified."""
     fitted = calibration.fitted
     plot = sheet.add_rows(
-        "rows parameters", "prior sigmas from the prior value", [_short(f.name) for f in fitted]
+        "rows parameters", "prior sigmas from the prior value", _short([f.name for f in fitted])
     )
     rows = np.arange(len(fitted), dtype=float)
     prior = {"left": np.array([-2.0]), "right": np.array([2.0])}
@@ -136,7 +136,7 @@ def plot_correlation(sheet: Sheet, calibration: Calibration) -> None:
     """Correlation matrix; nothing for one parameter."""
     from bokeh.palettes import RdBu11, interp_palette
 
-    names = [_short(f.name) for f in calibration.fitted]
+    names = _short([f.name for f in calibration.fitted])
     if len(names) < 2:
         return
     edges = np.arange(-0.5, len(names))
@@ -162,6 +162,7 @@ def plot_channels(sheet: Sheet, calibration: Calibration, log: str) -> list[str]
     return keys
 
 
-def _short(name: str) -> str:
-    """The last two words of a dotted name."""
-    return ".".join(name.split(".")[-2:])
+def _short(names: list[str]) -> list[str]:
+    """The last two parts of each name, or all of it where others end alike."""
+    short = [".".join(name.split(".")[-2:]) for name in names]
+    return [one if short.count(one) == 1 else name for one, name in zip(short, names, strict=True)]

@@ -85,7 +85,11 @@ class ChannelFit:
         return float(np.sqrt(np.mean((series - self.measured) ** 2)))
 
 
-@dataclass(frozen=True, eq=False)
+SHOWN = 10
+"""Parameters in the representation of a result."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """The result.
 
@@ -123,6 +127,15 @@ class Calibration:
             f for f in self.fitted
             if f.name == name or (alone and f"soil.{f.name.partition('.')[2]}" == name)
         )  # fmt: skip
+
+    def __repr__(self) -> str:
+        lines = [f"Calibration of {self.model.vehicle.name}: {self.sentence}"]
+        lines += [
+            f"  {f.name} {f.value:.5g} +- {f.sigma:.2g} {f.unit} (was {f.start:.5g}; {f.status})"
+            for f in self.fitted[:SHOWN]
+        ]
+        left = len(self.fitted) - SHOWN
+        return "\n".join([*lines, f"  and {left} more"] if left > 0 else lines)
 
     def converged(self) -> bool:
         """Whether the search converged; if not, values and sigma are not valid."""

@@ -89,7 +89,7 @@ def plot_paths(sheet: Sheet, d: GapDiagnosis, most: int) -> list[str]:
         plot.glyph("scatter", data, "", colour, "dot", more=more, tips=tips, size=6.0, line_width=0)
         look = {"background_fill_alpha": 0.0, "major_label_text_color": style.NEUTRAL}
         plot.panel.figure.add_layout(ColorBar(color_mapper=mapper, width=10, padding=2, **look), "right")
-        plot.panel.figure.title = Path(run.name).name
+        plot.panel.figure.title = f"{Path(run.name).name}: error of {name}, {CHANNEL_UNITS[name]}"
         plot.panel.figure.title.text_color = style.NEUTRAL
     return [f"path{i}" for i in range(len(runs))]
 

@@ -231,11 +231,10 @@ class Plot:
         """Dots with their intervals, at rows of `Sheet.add_rows`; `text` is what the pointer shows."""
         if text is None:
             text = [f"{v:.3g} [{a:.3g}, {b:.3g}]" for v, a, b in zip(values, low, high, strict=True)]
+        form, ends = "ring" if hollow else "dot", {"x0": low, "x1": high, "y0": rows, "y1": rows}
+        self.glyph("segment", ends, label, colour, form, line_width=2)
         self.glyph(
-            "segment", {"x0": low, "x1": high, "y0": rows, "y1": rows}, label, colour, "dot", line_width=2
-        )
-        self.glyph(
-            "scatter", {"x": values, "y": rows}, label, colour, "ring" if hollow else "dot", size=8.0,
+            "scatter", {"x": values, "y": rows}, label, colour, form, size=8.0,
             fill_alpha=0.0 if hollow else 1.0, more={"text": text}, tips={label: "@text"},
         )  # fmt: skip
 

@@ -83,6 +83,10 @@ def test_what_is_shown_is_short(log: tf.Recording, result: tf.Replay) -> None:
     for shown in (log, result, result.estimate, result.vehicle):
         assert 1 <= len(repr(shown).splitlines()) <= 12
         assert "<" in shown._repr_html_()
+    fit = tf.calibrate(log, parameters="vehicle.wheel.radius_m")
+    for plain in (log.imu, log.wheels, log.gnss, log.truth, fit):
+        assert 1 <= len(repr(plain).splitlines()) <= 12
+        assert len(repr(plain)) < 600
 
 
 def test_a_live_state_is_one_line(log: tf.Recording) -> None:

@@ -24,6 +24,7 @@ from terrafusion.fusion.cli.main import app
         ("--versoin", ("no option --versoin", "did you mean --version?")),
         ("replay x --out y --mode magic", ("--mode", "'magic'", "adaptive")),
         ("--quiet inspect x", ("--quiet stands behind the command",)),
+        ("gap a --reference r1 r2", ("'r2' behind --reference may be a run or a reference",)),
         ("inspect", ("LOG", "terrafusion inspect --help")),
     ],
 )

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from jinja2 import UndefinedError
 
+from terrafusion.fusion.reports.calibration import _short
 from terrafusion.fusion.reports.page import Tile, VerdictBox, write_page
+from terrafusion.fusion.reports.plots.sheet import Sheet
 
 HOSTILE = "<script>alert('x')</script>"
 
@@ -35,3 +38,16 @@ def test_a_missing_value_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(UndefinedError, match="groups"):
         sweep_page(tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_parameters_of_several_grounds_keep_the_name_of_their_ground() -> None:
+    names = ["vehicle.wheel.radius_m", "mud.shear.friction_cap", "snow.shear.friction_cap"]
+    assert _short(names) == ["wheel.radius_m", *names[1:]]
+    assert _short(names[:2]) == ["wheel.radius_m", "shear.friction_cap"]
+
+
+def test_a_hollow_mark_is_hollow_in_the_legend() -> None:
+    plot = Sheet().add_rows("rows a", "x", ["a"])
+    one = np.zeros(1)
+    plot.intervals(one, one, one, one, "open", "#0072b2", hollow=True)
+    assert plot.panel.legend["open"].form == "ring"
