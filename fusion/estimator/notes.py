@@ -29,7 +29,8 @@ def _on_fixes(gnss: GnssUpdater) -> list[str]:
             f"the first fixes ended before they showed the heading clearly: it was open at first; {then}"
         )
     elif gnss.local and not gnss.unaligned:
-        notes.append("no GNSS fix came in time: the path is local, its start and heading are arbitrary")
+        came = "came in time" if gnss.too_late or gnss.waiting else "came"
+        notes.append(f"no GNSS fix {came}: the path is local, its start and heading are arbitrary")
     elif gnss.local:
         fixes = counted(gnss.unaligned, "GNSS fix", "GNSS fixes")
         notes.append(
