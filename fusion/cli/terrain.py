@@ -70,15 +70,15 @@ def train(
 
 def train_on_logs(logs: list[str], vehicle: str | None, out: Path) -> Result:
     """Fit, calibrate and write the model of a robot."""
-    from terrafusion.datasets.readers import hashes_of
     from terrafusion.fusion.training.logged_runs import open_runs
     from terrafusion.fusion.training.train_detector import write_model
     from terrafusion.fusion.training.train_on_logs import train_on
 
+    inputs = inputs_of(logs)
     with progress("logs", len(logs)) as tick:
         runs = open_runs(logs, vehicle, tick)
     made_by = f"terrafusion terrain train --out {out.name}, {counted(len(runs), 'run')}"
-    model = train_on(runs, hashes_of(logs), made_by)
+    model = train_on(runs, inputs, made_by)
     write_model(model, out)
     windows = sum(len(r.route.windows) for r in runs)
     done = f"{windows} windows of {counted(len(runs), 'run')} on {', '.join(model.classes)}; written to {out}"
@@ -130,16 +130,15 @@ def evaluate(
 def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out: Path | None) -> Result:
     """Score models of the other folds, or the given one, on labelled logs; write the scores."""
     from terrafusion.datasets.core.json_text import finite, to_json
-    from terrafusion.datasets.readers import hashes_of
     from terrafusion.fusion.reports.page import write_text
     from terrafusion.fusion.training.logged_runs import open_runs
     from terrafusion.fusion.training.train_on_logs import cross_validated, scores_on
 
-    loaded = None if model is None else untrained_on(model, logs)
+    inputs, loaded = inputs_of(logs), None if model is None else untrained_on(model, logs)
     with progress("logs", len(logs)) as tick:
         runs = open_runs(logs, vehicle, tick)
     scores, spliced = cross_validated(runs) if loaded is None else (scores_on(loaded, runs), None)
-    report = {**dataclasses.asdict(scores), "inputs": hashes_of(logs)}
+    report = {**dataclasses.asdict(scores), "inputs": inputs}
     lines = score_lines(counted(len(runs), "run"), scores)
     if spliced is not None:
         report["spliced"] = dataclasses.asdict(spliced)
@@ -148,6 +147,19 @@ def evaluate_logs(logs: list[str], vehicle: str | None, model: Path | None, out:
         write_text(out, to_json(report, indent=1) + "\n")
     done = "" if out is None else f"written to {out}"
     return Result(lines, done, finite(report))
+
+
+def inputs_of(logs: list[str]) -> dict[str, str]:
+    """SHA-256 of the files of the logs, none of which is given twice: one would test the other."""
+    from terrafusion.datasets.readers import hashes_of
+
+    seen: dict[frozenset[str], str] = {}
+    for log in logs:
+        content = frozenset(hashes_of([log]).values())
+        if content in seen:
+            raise TerrafusionError(f"is the same log as {seen[content]}", file=log, remedy="give it once")
+        seen[content] = log
+    return hashes_of(logs)
 
 
 def untrained_on(path: Path, logs: list[str]) -> TerrainModel:

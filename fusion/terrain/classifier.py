@@ -128,10 +128,19 @@ class TerrainModel:
         return dataclasses.replace(self, classes=self.claimed, temperature=CLAIM_TEMPERATURE)
 
     def prior(self, classes: tuple[str, ...]) -> Array:
-        """Prior probabilities (k,) of the named classes."""
+        """Prior probabilities (k,) of the named classes.
+
+        Names without a density look like `unknown`; they share a third of its probability, so that they
+        neither take its place nor add to it until a camera names one.
+        """
         k = len(classes)
         if not self.slip_only or k == 1:
-            return np.full(k, 1.0 / k)
+            strange = np.array([name not in self.classes and name != UNKNOWN for name in classes])
+            count = int(strange.sum())
+            if not count:
+                return np.full(k, 1.0 / k)
+            known = [2.0 / 3.0 if name == UNKNOWN else 1.0 for name in classes]
+            return np.where(strange, 1.0 / 3.0 / count, known) / (k - count)
         others = (1.0 - FOREIGN_UNKNOWN) / (k - 1)
         return np.array([FOREIGN_UNKNOWN if name == UNKNOWN else others for name in classes])
 

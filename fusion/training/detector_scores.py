@@ -80,14 +80,18 @@ def drawn_patches(runs: Sequence[tuple[Run, str]], rng: np.random.Generator) -> 
         yield last, choices[int(rng.integers(len(choices)))]
 
 
+def long_stretches(runs: Sequence[tuple[list[Window], str]]) -> list[tuple[list[Window], str]]:
+    """Those of the runs (windows, ground) in which the robot moves long enough to be part of a route."""
+    return [(w, g) for w, g in runs if sum(x.ground_speed_mps() > MIN_SPEED_MPS for x in w) > 10]
+
+
 def splice(runs: Sequence[tuple[list[Window], str]], patches: int, seed: int) -> LabelledRoute:
     """One long route over `patches` grounds, cut from runs (windows, ground) on one ground each."""
     rng = np.random.default_rng([seed, 11])
-    moving = [(w, g) for w, g in runs if sum(x.ground_speed_mps() > MIN_SPEED_MPS for x in w) > 10]
     windows: list[Window] = []
     labels: list[str] = []
     starts: list[int] = []
-    for ground, source in itertools.islice(drawn_patches(moving, rng), patches):
+    for ground, source in itertools.islice(drawn_patches(long_stretches(runs), rng), patches):
         begin = int(rng.integers(max(len(source) - 20, 1)))
         length_m = PATCH_M[0] + rng.exponential(PATCH_M[1])
         driven = np.cumsum([w.ground_speed_mps() * UPDATE_S for w in source[begin:]])

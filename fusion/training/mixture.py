@@ -37,7 +37,8 @@ def fit_best(x: Array, sigma_floor: Array, order_by: int) -> Mixture:
         if best is None or bic < best[0]:
             best = (bic, mixture)
     if best is None:
-        raise ValueError(f"{len(x)} windows are too few to fit {d} features")
+        least = 4 * d * WINDOWS_PER_SAMPLE
+        raise ValueError(f"{len(x)} windows are too few to fit {d} features, {least} are needed")
     return best[1]
 
 

@@ -75,6 +75,12 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
             for ground, samples in logged_samples(recording, vehicle).items():
                 parts.setdefault(ground, []).append(samples)
     grounds = {name: GroundSamples.joined(found) for name, found in parts.items()}
+    if not grounds:
+        raise DataError(
+            f"the logs hold no {MEAN_S:g} s on one ground whose label is not '{UNKNOWN}'",
+            channel="terrain",
+            remedy="give longer drives on labelled ground, or no logs",
+        )
     for name, samples in grounds.items():
         if len(samples.slip) < MIN_SLIPS:
             raise DataError(

@@ -12,10 +12,17 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import Window
-from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
+from terrafusion.fusion.training.detector_scores import (
+    DetectorScores,
+    LabelledRoute,
+    evaluate,
+    long_stretches,
+    splice,
+)
 from terrafusion.fusion.training.logged_runs import LoggedRun
 from terrafusion.fusion.training.spectrum_fit import alarm_precision, fit_spectrum
 from terrafusion.fusion.training.train_detector import PATCHES, calibrate, draft, features_of
@@ -35,9 +42,10 @@ def train_on(runs: Sequence[LoggedRun], inputs: dict[str, str], made_by: str = "
     """
     check_runs(runs)
     half = assign_folds(runs, 2)
-    part = _fitted([run for run, fold in zip(runs, half, strict=True) if fold == 0])
-    held_out = [run for run, fold in zip(runs, half, strict=True) if fold == 1]
+    fitted_to, held_out = ([run for run, f in zip(runs, half, strict=True) if f == fold] for fold in (0, 1))
     stretches = [piece for run in held_out for piece in pieces(run)]
+    _check_halves(fitted_to, stretches)
+    part = _fitted(fitted_to)
     part = _with_alarm(calibrate(part, splice(stretches, PATCHES, 0)), stretches)
     model = _fitted(runs)
     spectrum = model.spectrum
@@ -81,7 +89,7 @@ def cross_validated(runs: Sequence[LoggedRun]) -> tuple[DetectorScores, Detector
     Raises:
         DataError: as `train_on`, also where a fold leaves a ground with a single run.
     """
-    check_runs(runs)
+    check_runs(runs, MIN_RUNS + 1)
     fold_of = assign_folds(runs, FOLDS)
     tried: list[tuple[TerrainModel, LabelledRoute]] = []
     spliced: list[tuple[TerrainModel, LabelledRoute]] = []
@@ -90,7 +98,7 @@ def cross_validated(runs: Sequence[LoggedRun]) -> tuple[DetectorScores, Detector
         held_out = [run for run, f in zip(runs, fold_of, strict=True) if f == fold]
         tried += [(model, run.route) for run in held_out]
         stretches = [piece for run in held_out for piece in pieces(run)]
-        if len({ground for _, ground in stretches}) > 1:
+        if len({ground for _, ground in long_stretches(stretches)}) > 1:
             spliced.append((model, splice(stretches, PATCHES, fold)))
     return evaluate(tried), evaluate(spliced) if spliced else None
 
@@ -111,26 +119,64 @@ def scores_on(model: TerrainModel, runs: Sequence[LoggedRun]) -> DetectorScores:
     return evaluate([(model, run.route) for run in runs])
 
 
-def check_runs(runs: Sequence[LoggedRun]) -> None:
-    """Refuse fewer than two grounds, or one without a run to leave out (DataError)."""
+def check_runs(runs: Sequence[LoggedRun], least: int = MIN_RUNS) -> None:
+    """Refuse fewer than two grounds, or one with fewer than `least` runs (DataError)."""
     counts = Counter(ground for run in runs for ground in run.grounds())
+    spelt: dict[str, str] = {}
+    for ground in sorted(counts):
+        like = spelt.setdefault(
+            "_".join(ground.replace("-", " ").replace("_", " ").casefold().split()), ground
+        )
+        if like != ground:
+            raise DataError(
+                f"grounds '{like}' and '{ground}' differ in spelling alone",
+                channel="terrain",
+                remedy="give them one name in the logs",
+            )
     if len(counts) < 2:
         raise DataError("training needs at least two grounds", channel="terrain", remedy="give more logs")
     for ground, count in sorted(counts.items()):
-        if count < MIN_RUNS:
+        if count < least:
             raise DataError(
-                f"ground '{ground}' has {count} run, {MIN_RUNS} are needed to leave one out",
+                f"ground '{ground}' has {counted(count, 'run')}, {least} are needed to leave one out",
                 channel="terrain",
                 remedy="give more runs of it, or none",
             )
 
 
+def _check_halves(fitted_to: Sequence[LoggedRun], stretches: Sequence[tuple[list[Window], str]]) -> None:
+    """Refuse a half to fit to that lacks a ground of the other, or one to calibrate on without a change."""
+    lacking = {ground for _, ground in stretches}.difference(*(run.grounds() for run in fitted_to))
+    if lacking:
+        raise DataError(
+            f"no two halves of the runs both have {', '.join(sorted(lacking))}",
+            channel="terrain",
+            remedy="give more runs of it, or runs on one ground each",
+        )
+    if len({ground for _, ground in long_stretches(stretches)}) < 2:
+        raise DataError(
+            "half of the runs lack two grounds with over 5 s of driving at a stretch",
+            channel="terrain",
+            remedy="give longer runs, or labels that change less often",
+        )
+
+
 def assign_folds(runs: Sequence[LoggedRun], folds: int) -> list[int]:
-    """The fold of each run: the runs of a ground, longest first, are dealt out in turn."""
+    """The fold of each run: the runs of a ground, longest first, are dealt out in turn.
+
+    A run over several grounds goes where they are rarest, so that every fold has of each.
+    """
     order = sorted(range(len(runs)), key=lambda i: (min(runs[i].grounds()), -len(runs[i].route.windows)))
+    total = Counter(ground for run in runs for ground in run.grounds())
+    dealt = [Counter[str]() for _ in range(folds)]
     fold_of = [0] * len(runs)
     for place, i in enumerate(order):
-        fold_of[i] = place % folds
+        grounds = sorted(runs[i].grounds())
+        fold_of[i] = min(
+            range(folds),
+            key=lambda f: (sum(dealt[f][g] / total[g] for g in grounds), (f - place) % folds),
+        )
+        dealt[fold_of[i]].update(grounds)
     return fold_of
 
 

@@ -17,7 +17,7 @@ from terrafusion.twin.sensors.imu import at_rest
 REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
-ABSENT = "not in the log, or with gaps"
+ABSENT = "not in the log, constant, or with gaps"
 GAP = 5.0
 """A step between samples that is so many times the usual one is a gap."""
 TURNING, DRIVEN_SHARE = 0.05, 0.01
@@ -168,7 +168,7 @@ def recording_at_rest(recording: Recording) -> ImuAtRest:
     """A recorded IMU, which should be at rest, in its longest stretch without a gap.
 
     Raises:
-        DataError: no IMU, or too short a log.
+        DataError: no IMU, too slow a one, or too short a log.
     """
     imu = recording.imu
     if imu is not None and len(imu) > 2:
@@ -183,10 +183,15 @@ def recording_at_rest(recording: Recording) -> ImuAtRest:
             channel="imu", remedy=f"give a log of {LEAST_S:g} s or more with the robot at rest",
         )  # fmt: skip
     rate_hz = (len(imu) - 1) / seconds
+    if rate_hz * SHORT_S < 1.0:
+        raise DataError(
+            f"{rate_hz:.2g} IMU samples a second are too few for an Allan deviation", file=recording.name,
+            channel="imu", remedy="log the IMU at its full rate",
+        )  # fmt: skip
     curves = {}
     for name, values in (("gyro", imu.gyro_radps), ("accel", imu.accel_mps2)):
-        axes = [column[np.isfinite(column)] for column in values.T]
-        curves[name] = [allan_deviation(column, rate_hz, 1) for column in axes if len(column) == len(imu)]
+        axes = [column for column in values.T if np.isfinite(column).all() and np.ptp(column) > 0.0]
+        curves[name] = [allan_deviation(column, rate_hz, 1) for column in axes]
     title = f"{recording.name}: IMU, {seconds:.0f} s at {rate_hz:.1f} Hz, mean of the axes"
     if (wheels := recording.wheels) is not None:
         during = (wheels.t_ns >= imu.t_ns[0]) & (wheels.t_ns <= imu.t_ns[-1])

@@ -163,6 +163,17 @@ def test_labels_of_the_detector_itself_are_none() -> None:
         logged_samples(dataclasses.replace(circled(), terrain=guess, terrain_name=""))
 
 
+@pytest.mark.parametrize(("seconds", "ground"), [(5.0, "grass"), (40.0, "unknown")])
+def test_logs_that_show_no_ground_are_refused(
+    monkeypatch: pytest.MonkeyPatch, seconds: float, ground: str
+) -> None:
+    log = dataclasses.replace(circled(seconds=seconds), terrain_name=ground)
+    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda name, rig: [log])
+    monkeypatch.setattr("terrafusion.datasets.readers.hashes_of", lambda logs: {})
+    with pytest.raises(DataError, match="no 6 s on one ground"):
+        read_logs(["made"])
+
+
 def test_too_little_driving_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "terrafusion.datasets.readers.open_recordings", lambda log, rig: [circled(seconds=8.0)]

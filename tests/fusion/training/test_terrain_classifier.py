@@ -13,7 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel, load_terrain_model
+from terrafusion.fusion.terrain.classifier import (
+    UNKNOWN,
+    LikelihoodTable,
+    TerrainModel,
+    load_terrain_model,
+)
+from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import FEATURES, SLIP, YAW_SLIP
 from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.training.mixture import fit, fit_best, shrink
@@ -87,6 +93,19 @@ def test_an_uncertain_slip_says_less(extra: float) -> None:
     sure, vague = np.full(D, 0.04**2), np.full(D, (0.04 + extra) ** 2)
     assert posterior(model, slip_only, vague).max() <= posterior(model, slip_only, sure).max() + 0.05
     assert posterior(model, slip_only, np.full(D, 1e4)).max() < 0.3
+
+
+def test_grounds_without_a_density_neither_replace_unknown_nor_crowd_out_known_ones(
+    model: TerrainModel,
+) -> None:
+    """As of a policy fitted to logs of another ground, or of a model of one's own grounds."""
+    known = (*model.classes, UNKNOWN)
+    for strange in (["moss"], ["moss", "lava", "ash"]):
+        detector, alone = (TerrainDetector(model, names) for names in ((*strange, *known), known))
+        p = dict(zip(detector.classes, detector.probabilities.tolist(), strict=True))
+        assert p["moss"] < 0.6 * p[UNKNOWN]
+        assert [p[name] for name in model.classes] == pytest.approx(alone.probabilities[:-1])
+        assert sum(p.values()) == pytest.approx(1.0)
 
 
 def test_a_foreign_robot_is_judged_by_its_slip_alone(model: TerrainModel) -> None:

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import terrafusion as tf
-from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.cli import main, terrain
@@ -137,6 +137,50 @@ def test_too_few_runs_or_grounds_are_refused_by_name(runs: list[LoggedRun]) -> N
         check_runs(runs[:13])
     with pytest.raises(DataError, match="at least two grounds"):
         train_on(runs[:6], {})
+
+
+@pytest.mark.parametrize(
+    "drives",
+    [
+        [("gravel lawn", 120), ("gravel", 180), ("gravel lawn", 90)],
+        [("gravel lawn", 120), ("gravel pavement", 119), ("gravel lawn", 118), ("gravel pavement", 117)],
+    ],
+)
+def test_runs_over_several_grounds_are_halved_so_that_both_know_each(drives: list[tuple[str, int]]) -> None:
+    runs = [made_run(words.split(), n, windows) for n, (words, windows) in enumerate(drives)]
+    halves = [set[str](), set[str]()]
+    for run, half in zip(runs, assign_folds(runs, 2), strict=True):
+        halves[half] |= run.grounds()
+    assert halves[0] == halves[1]
+    assert tuple(train_on(runs, {}).classes) == tuple(sorted(halves[0]))
+
+
+def test_runs_that_cannot_be_halved_are_refused() -> None:
+    drives = (("gravel pavement", 65), ("gravel lawn", 64), ("gravel", 100), ("gravel lawn pavement", 33))
+    with pytest.raises(DataError, match="no two halves of the runs both have lawn"):
+        train_on([made_run(words.split(), 0, windows) for words, windows in drives], {})
+    short = [
+        made_run([ground], n, windows) for n in (120, 8) for ground, windows in (("gravel", n), ("lawn", n))
+    ]
+    with pytest.raises(DataError, match="half of the runs lack two grounds"):
+        train_on(short, {})
+    two = [made_run([ground], n) for ground in ("gravel", "lawn") for n in range(2)]
+    with pytest.raises(DataError, match="ground 'gravel' has 2 runs, 3 are needed"):
+        cross_validated(two)
+
+
+def test_names_of_one_ground_and_logs_given_twice_are_refused(tmp_path: Path) -> None:
+    runs = [made_run(["lawn"], 0), made_run(["gravel"], 1)]
+    spelt = [
+        dataclasses.replace(run, route=changes_in(run.route.windows, np.full(60, "Lawn "))) for run in runs
+    ]
+    with pytest.raises(DataError, match="'Lawn ' and 'lawn' differ in spelling alone"):
+        check_runs([*runs, *spelt])
+    for name in ("monday", "copy"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "meta.yaml").write_text("start_ns: 0\nterrain: lawn\n")
+    with pytest.raises(TerrafusionError, match=r"copy: is the same log as .*monday"):
+        terrain.inputs_of([str(tmp_path / "monday"), str(tmp_path / "copy")])
 
 
 def test_written_and_read_back(model: TerrainModel, tmp_path: Path) -> None:

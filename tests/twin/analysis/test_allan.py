@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.allan import (
     ImuAtRest,
@@ -105,6 +106,17 @@ def test_a_recorded_imu_is_taken_between_gaps_and_a_drive_is_said() -> None:
     assert "the wheels turn in 100 % of it: this is no noise at rest" in driven.title
 
 
+def test_axes_that_a_log_holds_constant_are_left_out_and_a_slow_imu_is_refused() -> None:
+    t_ns = (np.arange(6000) * 10_000_000).astype(np.int64)
+    gyro = white(6000, 3, 1e-3)
+    gyro[:, :2] = 0.0
+    rest = recording_at_rest(Recording("parked", 0, imu=Imu(t_ns, gyro, np.full((6000, 3), 9.81))))
+    assert (len(rest.curves["gyro"]), rest.curves["accel"]) == (1, [])
+    assert inertial_noise(rest.curves["gyro"]).density == pytest.approx(1e-3, rel=0.1)
+    with pytest.raises(DataError, match=r"0\.5 IMU samples a second are too few"):
+        recording_at_rest(Recording("slow", 0, imu=Imu(t_ns * 200, gyro, gyro)))
+
+
 def wheels_at(t_ns: np.ndarray, speed: float) -> Wheels:
     return Wheels(t_ns, np.full((len(t_ns), 2), speed), ("left", "right"), "radps")
 
@@ -114,7 +126,7 @@ def test_text_and_json_tell_the_same_numbers() -> None:
     rest = ImuAtRest("a log", {"gyro": [curve], "accel": []}, {"gyro": (1e-3, 0.0, 0.0)})
     found = json.loads(json.dumps(rest.to_json(), allow_nan=False))
     assert found["accel"] is None
-    assert "accel: not in the log, or with gaps" in rest.lines()
+    assert "accel: not in the log, constant, or with gaps" in rest.lines()
     assert found["gyro"]["deviation"] == pytest.approx(curve.deviation)
     assert found["gyro"]["specified"] == [1e-3, 0.0, 0.0]
     assert f"estimated {found['gyro']['density']:.3e}" in "\n".join(rest.lines())
