@@ -210,7 +210,7 @@ def _table(
         yaw = numbers.pop("yaw_rad")
         rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)
         numbers |= dict(zip(QUATERNION, rpy_to_quaternion(rpy).T, strict=True))
-    if YAW_RATE in numbers:
+    if {"speed_mps", YAW_RATE} <= numbers.keys():  # alone, it is a command's
         speed, half = numbers.pop("speed_mps"), 0.5 * track_m * numbers.pop(YAW_RATE)
         numbers |= {"left_mps": speed - half, "right_mps": speed + half}
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
