@@ -44,12 +44,12 @@ REDUCED = ("gyro z", "no accelerometer", "no imu", "body speed")
 
 @pytest.fixture(scope="module")
 def exact() -> Recording:
-    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 80.0)
+    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 50.0)
 
 
 @pytest.fixture(scope="module")
 def noisy() -> Recording:
-    return until(simulate("waypoints", terrain="medium_sand", seed=3), 100.0)
+    return until(simulate("waypoints", terrain="medium_sand", seed=3), 60.0)
 
 
 @pytest.fixture(scope="module")
