@@ -18,6 +18,8 @@ STAMP_S = 0.05
 """By which stamps of fixes may be wrong from one to the next (assumed)."""
 JUMP_SIGMA, LEAST_M = 6.0, 0.1
 """Sigmas of both fixes, and distance, that a jump exceeds."""
+SKID_SIGMA, SKID_LEAST_M = 3.0, 0.5
+"""The same, by white errors alone, of one that exceeds what the robot can have skidded meanwhile."""
 CONSTANT, SAME_PLACE = 0.2, 0.5
 """Shares of the jump by which offsets after it may differ, and up to which a fix continues them."""
 BETTER = 0.5
@@ -40,11 +42,11 @@ class FixJump:
 
     @classmethod
     def of(
-        cls, before: list[FixPair], after: list[FixPair], heading: complex, scale: float
+        cls, before: list[FixPair], after: list[FixPair], heading: complex, scale: float, white: float
     ) -> FixJump | None:
         """The jump between used and rejected fixes; None where the offsets are small, or grow as in a skid.
 
-        Sigmas are taken times `scale`.
+        Sigmas are taken times `scale`; `white` is the share of their squares that is white.
         """
         if len(before) < USED or len(after) < USED:
             return None
@@ -54,7 +56,9 @@ class FixJump:
             return None
         sigma_m = scale * math.hypot(b.sigma_m, c.sigma_m)
         offset_m = residual_m(b, c, heading)
-        if c.sigma_m < BETTER * b.sigma_m or abs(offset_m) < max(JUMP_SIGMA * sigma_m, LEAST_M):
+        no_skid = exceeds_skid(before, after, heading, scale * math.sqrt(white))
+        large = no_skid or abs(offset_m) > max(JUMP_SIGMA * sigma_m, LEAST_M)
+        if c.sigma_m < BETTER * b.sigma_m or not large:
             return None
         grown_m = max(abs(residual_m(c, one, heading)) for one in after)
         if grown_m > CONSTANT * abs(offset_m) + sigma_m:
@@ -65,12 +69,27 @@ class FixJump:
         stamps_m = STAMP_S * max(abs(first), abs(last))
         # Speed up for half of the time and down for the other, beyond the mean of both speeds.
         most_m = 0.25 * MOST_MPS2 * step_s**2 + stamps_m + 3.0 * noise_m
-        return cls(offset_m, heading, beyond_m > most_m)
+        return cls(offset_m, heading, no_skid or beyond_m > most_m)
 
     def continued(self, last: FixPair, pair: FixPair, scale: float) -> bool:
         """Whether a fix follows the `last` one held off along the path."""
         near_m = SAME_PLACE * abs(self.offset_m) + scale * math.hypot(last.sigma_m, pair.sigma_m)
         return abs(residual_m(last, pair, self.heading)) < near_m
+
+
+def exceeds_skid(before: list[FixPair], after: list[FixPair], heading: complex, scale: float) -> bool:
+    """Whether fixes before and after a jump lie further apart than a robot can have skidded between them.
+
+    Its wheels roll for nothing, at most, while the speed it had is turned round. White errors are `scale`
+    times the fixes' sigmas.
+    """
+    a, b, c = before[-2], before[-1], after[0]
+    speed_mps = abs(b.z - a.z) / (b.t_ns - a.t_ns) * 1e9
+    skidded_m = c.reach_m - b.reach_m + speed_mps * (c.t_ns - b.t_ns) * 1e-9
+    sides = [(sum(residual_m(b, one, heading) for one in side) / len(side), side) for side in (before, after)]
+    variances_m2 = [scale**2 * max(one.sigma_m for one in side) ** 2 / len(side) for _, side in sides]
+    least_m = skidded_m + SKID_SIGMA * math.sqrt(sum(variances_m2))
+    return abs(sides[1][0] - sides[0][0]) > max(least_m, SKID_LEAST_M)
 
 
 def residual_m(one: FixPair, other: FixPair, heading: complex) -> complex:

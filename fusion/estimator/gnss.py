@@ -238,8 +238,8 @@ class GnssUpdater:
             return GateDecision.ACCEPT, nis
         if verdict is GateDecision.ACCEPT or self._pair is None:
             return verdict, nis
-        place, scale = self._antenna(chain, predicted.k), self.fix_noise.scale
-        if self.plausible.rejected(self._pair, place, self.track, scale):
+        place, noise = self._antenna(chain, predicted.k), self.fix_noise
+        if self.plausible.rejected(self._pair, place, self.track, noise.scale, noise.white):
             return GateDecision.REACQUIRE, nis
         return (verdict if self._within_reach else GateDecision.REJECT), nis
 

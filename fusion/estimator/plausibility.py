@@ -205,14 +205,19 @@ class FixPlausibility:
         for one in run.pairs:
             one.usable = True
 
-    def rejected(self, pair: FixPair, estimate: complex, track: DeadReckoning, scale: float) -> bool:
-        """Take a fix that the gate rejects; True where its place is now believed although beyond reach."""
+    def rejected(
+        self, pair: FixPair, estimate: complex, track: DeadReckoning, scale: float, white: float
+    ) -> bool:
+        """Take a fix that the gate rejects; True where its place is now believed although beyond reach.
+
+        Sigmas are taken times `scale`; `white` is the share of their squares that is white.
+        """
         if not self.anchors:
             self.anchors.append(dataclasses.replace(pair, fix=estimate))
         if self._believed:
             return True
         self.run = self._continued(pair, scale)
-        if self.run.reachable and self._jumped(self.run, track.heading, scale):
+        if self.run.reachable and self._jumped(self.run, track.heading, scale, white):
             return True
         pair.usable = self.run.reachable
         pair.alone = not pair.usable and len(self.run.pairs) == 1
@@ -234,9 +239,9 @@ class FixPlausibility:
         self._move(self.run, pair, DOUBT, DOUBT_M)
         return True
 
-    def _jumped(self, run: FixRun, heading: complex, scale: float) -> bool:
+    def _jumped(self, run: FixRun, heading: complex, scale: float, white: float) -> bool:
         """Test a run for a jump; True where it leads back to the place before the last one."""
-        run.jump = jump = FixJump.of(self._used, run.pairs, heading, scale)
+        run.jump = jump = FixJump.of(self._used, run.pairs, heading, scale, white)
         if jump is None:
             return False
         if self.jump_m is not None and abs(jump.offset_m + self.jump_m) < SAME_PLACE * abs(self.jump_m):

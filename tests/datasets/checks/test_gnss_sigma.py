@@ -75,3 +75,17 @@ def test_fixes_that_scatter_as_they_claim_claim_metres() -> None:
     claims = with_sigma(noisy, np.full(len(good.gnss), 0.4), Fix.FIXED)
     assert "sigma-dilution" not in codes(claims)
     assert "sigma-dilution" in codes(with_sigma(good, np.full(len(good.gnss), 0.4), Fix.FIXED))
+
+
+def test_a_few_wild_fixes_do_not_make_the_sigmas_too_small() -> None:
+    good, rng = lively_drive(), np.random.default_rng(7)
+    assert good.gnss is not None
+    sigma_m, noise = np.full(len(good.gnss), 0.1), rng.normal(0.0, 0.1, good.gnss.enu_m.shape)
+    wild = np.where(rng.random((len(sigma_m), 1)) < 0.06, rng.normal(0.0, 12.0, noise.shape), 0.0)
+
+    def found(errors: np.ndarray) -> set[str]:
+        gnss = dataclasses.replace(good.gnss, enu_m=good.gnss.enu_m + errors)
+        return codes(with_sigma(dataclasses.replace(good, gnss=gnss), sigma_m, Fix.SINGLE))
+
+    assert "sigma-too-small" not in found(noise + wild)
+    assert "sigma-too-small" in found(8.0 * noise)

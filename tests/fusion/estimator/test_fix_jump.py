@@ -43,22 +43,39 @@ def test_a_jump_is_a_reason_to_doubt_the_run() -> None:
     assert "they jumped there as no robot moves" in " ".join(found.reasons)
 
 
-def pairs(points: list[complex], step_s: float, driven_m: float, sigma_m: float = 0.014) -> list[FixPair]:
-    return [FixPair(round(i * step_s * 1e9), i * driven_m + 0j, p, sigma_m) for i, p in enumerate(points)]
+def pairs(points: list[complex], step_s: float, driven_m: float, sigma_m: float) -> list[FixPair]:
+    return [
+        FixPair(round(i * step_s * 1e9), i * driven_m + 0j, p, sigma_m, i * driven_m)
+        for i, p in enumerate(points)
+    ]
+
+
+TURN = cmath.rect(1.0, 0.7)
+
+
+def jump(
+    offsets: list[complex], step_s: float, driven_m: float, sigma_m: float = 0.014, white: float = 1.0
+) -> FixJump | None:
+    """The jump of two used fixes and the rejected ones after them, so far off a straight path."""
+    points = [TURN * (i * driven_m + off) for i, off in enumerate(offsets)]
+    both = pairs(points, step_s, driven_m, sigma_m)
+    return FixJump.of(both[:2], both[2:], TURN, 1.0, white)
 
 
 def test_only_a_constant_offset_that_needs_too_much_acceleration_is_a_jump() -> None:
-    turn = cmath.rect(1.0, 0.7)
-
-    def jump(offsets: list[complex], step_s: float, driven_m: float = 0.24) -> FixJump | None:
-        points = [turn * (i * driven_m + off) for i, off in enumerate(offsets)]
-        both = pairs(points, step_s, driven_m)
-        return FixJump.of(both[:2], both[2:], turn, 1.0)
-
-    wrong, slow = jump([0, 0, 0.8j, 0.8j], 0.2), jump([0, 0, 0.8j, 0.8j], 1.0)
+    wrong, slow = jump([0, 0, 0.8j, 0.8j], 0.2, 0.24), jump([0, 0, 0.8j, 0.8j], 1.0, 0.5)
     assert wrong is not None
     assert wrong.impossible
     assert slow is not None
     assert not slow.impossible
-    assert jump([0, 0, 0.4j, 0.8j], 0.2) is None
-    assert jump([0, 0, 0.05j, 0.05j], 0.2) is None
+    assert jump([0, 0, 0.4j, 0.8j], 0.2, 0.24) is None
+    assert jump([0, 0, 0.05j, 0.05j], 0.2, 0.24) is None
+
+
+def test_coarse_fixes_that_jump_further_than_wheels_can_skid_are_no_skid() -> None:
+    wrong = jump([0, 0, 6j, 6j], 1.0, 1.4, 1.2, 0.4)
+    assert wrong is not None
+    assert wrong.impossible
+    assert jump([0, 0, 2.8j, 2.8j], 1.0, 1.4, 1.2, 0.4) is None
+    assert jump([0, 0, 6j, 6j], 1.0, 1.4, 1.2, 1.0) is None  # all of the sigma is white
+    assert jump([0, 0, 6j, 6j], 1.0, 3.0, 1.2, 0.4) is None  # a faster robot may have skidded there
