@@ -1,7 +1,5 @@
 """The numbers of a robot while it drives: a step of the smoother every few seconds, in slices."""
 
-from __future__ import annotations
-
 import statistics
 from collections import deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Does a value fit the annotation of a dataclass field?"""
 
-from __future__ import annotations
-
 import functools
 import types
 import typing

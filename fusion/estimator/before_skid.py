@@ -1,7 +1,5 @@
 """What was known of the robot before a skid: as long as it lasts, the wheels tell wrong numbers."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from terrafusion.fusion.calibration.numbers import Knowledge

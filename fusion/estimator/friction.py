@@ -7,8 +7,6 @@ likelihood (multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). Th
 displacement and acceleration from the friction model instead of the wheels.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """GNSS fixes on their way into the chain: timing, gates, weights."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """The states of a run, collected, smoothed, and turned into an `Estimate`."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Self-calibration as the estimator uses it: which numbers it learns, and where they go."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -5,8 +5,6 @@ Until fixes come the path is local: its start and heading are arbitrary. Wheels 
 is turned and shifted as a whole. States already reported stay as they are.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

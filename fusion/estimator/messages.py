@@ -1,7 +1,5 @@
 """Messages of a recording or a driver as an estimator takes them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

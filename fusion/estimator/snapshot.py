@@ -9,8 +9,6 @@ Layout: `MAGIC`, SHA-256 of the rest (32 bytes), length of the tree (8 bytes, li
 UTF-8, the arrays end to end.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

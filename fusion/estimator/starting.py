@@ -1,7 +1,5 @@
 """The start of an estimator: waits until heading is known, or until GNSS has been waited for long enough."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several drives of the demo in one picture, one table and one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

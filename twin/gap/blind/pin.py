@@ -1,7 +1,5 @@
 """Version of the plant: a hash over its source, its shapes and the numbers it takes."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

@@ -6,8 +6,6 @@ is, as a share of it, because the robot's law is another. They are fitted to set
 tests.studies.gap_sets`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ would depend on, and its signature in each channel by itself join the covariance
 the effect (after Kennedy and O'Hagan 2001, with a basis in place of a Gaussian process).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Noise of each channel, learnt from the reference runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evidence of a diagnosis: whitened residuals of all runs against one twin, set to the references."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The fit of the twin to references, kept on disk: several diagnoses have the same references."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Sequence

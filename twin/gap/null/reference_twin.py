@@ -5,8 +5,6 @@ Effects are changes of a twin that drives as the references do: such numbers are
 Gauss-Newton steps (Marquardt 1963), from the best of a few starts.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

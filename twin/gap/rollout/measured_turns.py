@@ -7,8 +7,6 @@ gyro's noise is small. What the twin turns wrongly shows in the gyro alone, what
 the fixes. Nothing is lost: the map from gyro and fixes to these has an inverse.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Batched runs of the plant: specs in, `Recording`s out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
