@@ -381,12 +381,6 @@ class Estimator:
         self.monitor.watch(t_ns, chain.state(chain.last), self.chain.covariance[VELOCITY, VELOCITY], rolled_m)
         return self._emitted(t_ns, gyro)
 
-    @property
-    def _reported_covariance(self) -> Array:
-        """Covariance (dim, dim) of the newest keyframe, with the doubt of antenna and delay of the fixes."""
-        R = self.chain.state(self.chain.last).rotation
-        return self._place_doubt.widened(self.chain.covariance, R, self.learned.place_moments())
-
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
         fresh, self._fresh = self._fresh, None
@@ -429,7 +423,8 @@ class Estimator:
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
         aided = not (self.gnss.local or self.gnss.is_outage(t_ns))
         self._place_doubt.step(t_ns, key, float(key.rate(gyro)[2]), aided)
-        covariance = self._reported_covariance
+        moments = self.learned.place_moments()
+        covariance = self._place_doubt.widened(self.chain.covariance, key.rotation, moments)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),

@@ -67,9 +67,9 @@ class FixJump:
         most_m = 0.25 * MOST_MPS2 * step_s**2 + stamps_m + 3.0 * noise_m
         return cls(offset_m, heading, beyond_m > most_m)
 
-    def continued(self, last: FixPair, pair: FixPair, scale: float) -> bool:
+    def continued(self, last: FixPair, pair: FixPair) -> bool:
         """Whether a fix follows the `last` one held off along the path."""
-        near_m = SAME_PLACE * abs(self.offset_m) + scale * math.hypot(last.sigma_m, pair.sigma_m)
+        near_m = SAME_PLACE * abs(self.offset_m) + math.hypot(last.sigma_m, pair.sigma_m)
         return abs(residual_m(last, pair, self.heading)) < near_m
 
 

@@ -92,11 +92,7 @@ class History:
             self.states = [rounded(gnss.open_heading.widened(state)) for state in self.states]
 
     def estimate(
-        self,
-        classes: tuple[str, ...],
-        changes: list[WeightChange],
-        notes: tuple[str, ...],
-        start_ns: int = 0,
+        self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...], start_ns: int = 0
     ) -> Estimate:
         """All keyframes as arrays along time, of a recording that began at `start_ns`."""
         states = self.states

@@ -88,7 +88,7 @@ class FixRun:
 
     def follows(self, pair: FixPair) -> bool:
         """Whether a fix continues the jump of the run."""
-        return self.jump is not None and self.jump.continued(self.pairs[-1], pair, 1.0)
+        return self.jump is not None and self.jump.continued(self.pairs[-1], pair)
 
     def append(self, pair: FixPair) -> None:
         """Continue the run."""

@@ -1,5 +1,7 @@
 """Drives of the trials: commanded segments whose numbers vary from run to run."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Sequence
 

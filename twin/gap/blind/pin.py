@@ -1,5 +1,7 @@
 """Version of the plant: a hash over its source, its shapes and the numbers it takes."""
 
+from __future__ import annotations
+
 import functools
 import hashlib
 import json

@@ -4,6 +4,8 @@ A shape turns changes of the plant in proportion to one value e. Laws of the shi
 the catalogue; neither are the effects `OUTSIDE`, which a diagnosis can at best call unknown.
 """
 
+from __future__ import annotations
+
 import functools
 import math
 from dataclasses import dataclass

@@ -166,12 +166,7 @@ class _Explainer:
 
 
 def explain(
-    evidence: GapEvidence,
-    sigma: Array,
-    robot: RobotOffsets,
-    *,
-    close: bool,
-    without: Collection[str] = (),
+    evidence: GapEvidence, sigma: Array, robot: RobotOffsets, *, close: bool, without: Collection[str] = ()
 ) -> Explanation:
     """Log evidence of sets of effects.
 

@@ -129,8 +129,7 @@ class _Fit:
         return stable_steps(DT_S, plant_of(self.runs[0].log, model), INTEGRATOR_ORDER)
 
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or needs too
-        many steps."""
+        """Whitened errors (n,) of the runs at some points; None where the twin diverges or is too stiff."""
         models, count = [self.model(w) for w in points], len(self.runs)
         most = max(MOST_STEPS, self.steps(self.cache.model))
         soft = [self.steps(model) <= most for model in models]

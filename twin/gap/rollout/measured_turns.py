@@ -66,8 +66,7 @@ def _gyro(log: PreparedLog) -> int | None:
 
 
 def _integral(log: PreparedLog, gyro: int, at: int, rates: Array) -> Array:
-    """Integral (n, k) of rates (m, k) of the gyro's samples, from each window's start to the samples of a
-    channel."""
+    """Integral (n, k) of the gyro's rates (m, k) from each window's start to the samples of a channel."""
     rate, fix = log.observed[gyro], log.observed[at]
     of_rate, of_fix = window_index(log, gyro), window_index(log, at)
     out = np.zeros((len(fix.value), rates.shape[1]), dtype=rates.dtype)

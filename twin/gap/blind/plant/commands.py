@@ -1,5 +1,7 @@
 """Wheel speed commands: commanded segments, limits of the robot's controller, delays."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

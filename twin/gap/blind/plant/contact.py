@@ -1,5 +1,7 @@
 """Wheel on ground, in the plant's own laws. Arrays are (4, B): wheel by run; SI units."""
 
+from __future__ import annotations
+
 import functools
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Soil that varies: random fields over the plane, one set a run, and one draw a run."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,6 +7,8 @@ sigma) from the relaxation length sigma; drag, braking torque and speed loop are
 linear system: wheel speeds are eliminated, three equations of the body remain.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Changes of the plant by which effects act: numbers that are zero in the nominal robot."""
 
+from __future__ import annotations
+
 CHANGES: dict[str, str] = {
     # ground
     "strength": "log of the gain of cohesion, friction and cap",

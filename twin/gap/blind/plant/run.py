@@ -1,5 +1,7 @@
 """Batched runs of the plant: specs in, `Recording`s out."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,6 +4,8 @@ Each takes the history of one run (arrays (N,) or (N, 4) by name) and draws from
 `noiseless` the readings are exact.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Inputs of a run of the plant, and the numbers of many runs stacked."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
