@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -48,8 +48,8 @@ STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothin
 @functools.cache
 def drives() -> dict[str, Scenario]:
     """Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
-    with resources.as_file(resources.files("terrafusion.twin.gap.answer") / "next_drives.yaml") as path:
-        return {name: scenario_of({"drive": d}, str(path), name) for name, d in read_yaml(path).items()}
+    path = Path(__file__).with_name("next_drives.yaml")
+    return {name: scenario_of({"drive": d}, str(path), name) for name, d in read_yaml(path).items()}
 
 
 @dataclass(frozen=True)
