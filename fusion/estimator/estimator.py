@@ -7,12 +7,10 @@ est.add_gnss(t_ns, enu_m, sigma_m)
 state = est.latest()
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gtsam
 import numpy as np
@@ -139,7 +137,7 @@ class Estimator:
     @classmethod
     def for_vehicle(
         cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive", sensors: Sensors = None
-    ) -> Estimator:
+    ) -> Self:
         """For a vehicle, given by name, YAML file or itself, with the `sensors` of `sensors_of`."""
         params = as_vehicle(vehicle)
         return cls(EstimatorConfig(params.rig(), params.name, mode, inputs=sensors_of(sensors)))
@@ -255,7 +253,7 @@ class Estimator:
         return snapshot.dump(self)
 
     @classmethod
-    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Self:
         """An estimator that continues from `dump` with the same bits; see `snapshot.restore`."""
         return snapshot.restore(cls(config, **callbacks), data)
 

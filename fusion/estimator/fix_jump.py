@@ -5,10 +5,9 @@ there: to cover the step between two fixes, and to move before and after it as t
 an acceleration that no ground gives. A skid needs time: it grows while the robot drives.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
+from typing import Self
 
 from terrafusion.fusion.estimator.dead_reckoning import FixPair
 
@@ -39,9 +38,7 @@ class FixJump:
     impossible: bool
 
     @classmethod
-    def of(
-        cls, before: list[FixPair], after: list[FixPair], heading: complex, scale: float
-    ) -> FixJump | None:
+    def of(cls, before: list[FixPair], after: list[FixPair], heading: complex, scale: float) -> Self | None:
         """The jump between used and rejected fixes; None where the offsets are small, or grow as in a skid.
 
         Sigmas are taken times `scale`.
