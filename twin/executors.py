@@ -70,8 +70,7 @@ class Workers:
                 self.check()
 
     def by_key(self, calls: Mapping[K, tuple[Callable[..., T], tuple[Any, ...]]]) -> Iterator[tuple[K, T]]:
-        """Results of calls (function, arguments) with their keys, in the order in which they finish; raises
-        as `results`."""
+        """Results of calls (function, arguments) with their keys, as they finish; raises as `results`."""
         return self.results(_keyed, ((key, *call) for key, call in calls.items()))
 
 

@@ -1,7 +1,5 @@
 """Delays of the vehicle file, which the estimator takes out of the stamps, and how well they are known."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -285,8 +285,7 @@ def far_lag(one: Signal, other: Signal) -> Lag | None:
 
 
 def odd_one(recording: Recording, off: set[Pair], measured: set[Pair]) -> str:
-    """The channel that disagrees with the largest share of the others, of equals with most of them, of
-    equals the one of lowest rate."""
+    """The channel that disagrees with most others, by share, then by number; of equals the slowest."""
 
     def oddness(name: str) -> tuple[float, int, float]:
         count = sum(name in pair for pair in off)

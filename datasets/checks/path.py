@@ -141,7 +141,7 @@ def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFit
     t_fix, g = measured.t_s[inside], measured.place[inside]
     if len(t_fix) < 2 * LEAST_FIXES:
         return None
-    distance = rolled * _crude_scale(t, rolled, t_fix, g)
+    distance = rolled * _crude_scale(rolled, t_fix, g)
     longest_m = max(SHORTEST_M, float(distance[-1]) / (LEAST_WINDOWS + 1))
     length_m = float(np.clip(SIGMAS * measured.sigma_m, SHORTEST_M, longest_m))
     passed = np.maximum(np.diff(distance) / length_m, np.diff(t) / LONGEST_S)
@@ -149,7 +149,7 @@ def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFit
     return _fit(context, window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * measured.sigma_m))
 
 
-def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
+def _crude_scale(rolled: Array, t_fix: Array, g: Complex) -> float:
     """Measured path over distance rolled, if it may be a unit: windows are the same in any unit."""
     grid = np.arange(t_fix[0], t_fix[-1], 5.0)
     total = float(rolled[-1])

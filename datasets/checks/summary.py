@@ -95,9 +95,7 @@ def clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
 
 
 def mean_rate_hz(t_ns: TimesNs) -> float | None:
-    """Rate over the span without its gaps: of stamps that vary by the time on the way the median interval is
-    too short.
-    """
+    """Rate over the span without gaps: where stamps vary by the time on the way the median is too short."""
     held = np.diff(t_ns)[~is_gap(t_ns)] * 1e-9
     return len(held) / float(held.sum()) if held.sum() > 0.0 else None
 

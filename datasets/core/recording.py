@@ -12,15 +12,7 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from terrafusion.datasets.core.messages import Message
-from terrafusion.datasets.core.quantity import Quantity, Whole
-from terrafusion.datasets.core.tables import CLOCK_COLUMNS, clock_line, clock_rows, table_html
-from terrafusion.datasets.core.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from terrafusion.datasets.core.arrays import TimesNs
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import (
     Barometer,
     Channel,
@@ -33,6 +25,13 @@ from terrafusion.datasets.core.channels import (
     Terrain,
     Wheels,
 )
+from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.quantity import Quantity, Whole
+from terrafusion.datasets.core.tables import clock_line, clock_rows, clock_table_html
+from terrafusion.datasets.core.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ class Recording:
         return "\n".join([self._title(), *map(clock_line, self._rows())])
 
     def _repr_html_(self) -> str:
-        return table_html(self._title(), CLOCK_COLUMNS, self._rows())
+        return clock_table_html(self._title(), self._rows())
 
     def channels(self) -> dict[str, Channel]:
         """The channels that are present, by name, without the truth."""

@@ -29,8 +29,7 @@ SKIDDING = ("skid_steer", "tracked")
 
 
 def antenna_spread_m(wheelbase_m: float) -> float:
-    """1 sigma of an antenna that sits anywhere between the axles, from their middle; no less than that of a
-    small robot."""
+    """1 sigma of an antenna anywhere between the axles, from their middle; at least a small robot's."""
     return max(ANTENNA_SIGMA_M, wheelbase_m / math.sqrt(12.0))
 
 

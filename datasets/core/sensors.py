@@ -197,9 +197,7 @@ NO_SIGMA = "fixes have no sigma"
 def with_assumed_sigma(
     rig: Rig | None, sigma: Array, fix: NDArray[np.uint8], every: NDArray[np.uint8] | None = None
 ) -> tuple[Array, list[str]]:
-    """Sigmas (N, 3) with the unknown and the non-positive ones filled (`assumed_sigma`), and a note where
-    any was.
-    """
+    """Sigmas (N, 3), unknown and non-positive ones filled (`assumed_sigma`); a note where any was."""
     unknown = ~(sigma > 0.0)
     if not unknown[:, :2].any():
         sigma = np.where(unknown, np.nan, sigma)

@@ -67,9 +67,9 @@ def clock_line(row: tuple[str, ...]) -> str:
     return f"  {name:13s}{count:>9s} rows {rate:>8s} Hz  {first} to {last} s"
 
 
-def table_html(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A title and a table as HTML; every cell is escaped."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+def clock_table_html(title: str, rows: Iterable[Sequence[str]]) -> str:
+    """A title and `clock_rows` as HTML; every cell is escaped."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in CLOCK_COLUMNS)
     body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
     return f"<p>{escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 

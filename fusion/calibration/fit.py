@@ -8,8 +8,6 @@ the numbers by a Schur complement (`reduction`), so that the result's covariance
 all else unknown. The spread and the correlation time of slip are estimated, too (`slip`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Wheels, turns and fixes of a stretch of driving, and the path that the numbers of a robot make of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

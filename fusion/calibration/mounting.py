@@ -111,9 +111,7 @@ class MountingAngle:
         self._moves, self._windows = [], []
 
     def add(self, dt_s: float, rolled_m: float, turn_rad: float, force_mps2: Array) -> bool:
-        """Motion over `dt_s` by wheels and gyro, and the mean specific force (3,) as measured; True when
-        the angle changed.
-        """
+        """Motion over `dt_s` by wheels and gyro, mean specific force (3,); True when the angle changed."""
         self._moves.append((dt_s, rolled_m / dt_s, turn_rad, complex(*force_mps2[:2]) * dt_s))
         if sum([move[0] for move in self._moves]) < WINDOW_S + dt_s:
             return False

@@ -1,12 +1,11 @@
 """The numbers of a robot that its own fixes determine, and their priors."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.special import erfcx
@@ -110,7 +109,7 @@ class Knowledge:
         sigma.flags.writeable = False
         return np.asarray(sigma)
 
-    def outwards(self) -> Knowledge:
+    def outwards(self) -> Self:
         """With a course lag that is not negative: a robot that skids in a turn is carried outwards.
 
         Where the best one is negative, all numbers are as they are without any. What it may be all the same
@@ -128,20 +127,20 @@ class Knowledge:
         mean = self.mean - gain * lag_s
         return dataclasses.replace(self, mean=mean, covariance=without, clipped_lag_s=clipped_s)
 
-    def given(self, rows: Sequence[int], held: Sequence[int], before: Knowledge) -> tuple[Array, Array]:
+    def given(self, rows: Sequence[int], held: Sequence[int], before: Self) -> tuple[Array, Array]:
         """Mean (n,) and covariance (n, n) of the numbers `rows` if those `held` are as `before`."""
         covariance = self.covariance
         gain = covariance[np.ix_(rows, held)] @ np.linalg.pinv(covariance[np.ix_(held, held)])
         mean = self.mean[rows] - gain @ (self.mean - before.mean)[held]
         return mean, covariance[np.ix_(rows, rows)] - gain @ covariance[np.ix_(held, rows)]
 
-    def with_covariance(self, covariance: Array, wide: Knowledge) -> Knowledge:
+    def with_covariance(self, covariance: Array, wide: Self) -> Self:
         """With another covariance (8, 8), scaled so that no number is known less well than in `wide`."""
         limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
         shrink = np.sqrt(limit / np.diag(covariance))
         return dataclasses.replace(self, covariance=covariance * np.outer(shrink, shrink))
 
-    def stated_sigma(self, before: Knowledge, misfit: float = 1.0) -> Array:
+    def stated_sigma(self, before: Self, misfit: float = 1.0) -> Array:
         """1 sigma (8,) with what slip imitates; at most that `before` the drive.
 
         That grows with the `misfit`: what slip leaves of the fixes' residuals is a measure of the rest.

@@ -1,7 +1,5 @@
 """The numbers of a robot while it drives: a step of the smoother every few seconds, in slices."""
 
-from __future__ import annotations
-
 import statistics
 from collections import deque
 from collections.abc import Sequence
@@ -113,9 +111,7 @@ class SelfCalibration:
             self.usual_sigma_m = statistics.median(self._sigmas_m)
 
     def advance(self) -> bool:
-        """A slice of the step under way, or of the next one where that is due; True when it ends and the
-        numbers changed.
-        """
+        """A slice of the step under way, or of the next due one; True when it ends with other numbers."""
         try:
             if self._work is None:
                 if self._due():

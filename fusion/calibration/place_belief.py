@@ -6,11 +6,10 @@ from the ratio of the densities, after and before the drive, of the first (Dicke
 42(1), 204).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +55,7 @@ class PlaceBelief:
     @classmethod
     def of(
         cls, known: Knowledge, before: Knowledge, corrected: NDArray[np.bool_], antenna_assumed: bool = False
-    ) -> PlaceBelief:
+    ) -> Self:
         """By what is `known` after the drive and `before` it.
 
         `corrected` (3,) are the numbers of which the drive shows that they are others. An antenna of which it

@@ -4,11 +4,9 @@ The nodes of a drive follow each other, so that their normal equations are block
 as a border. They are assembled a few nodes at a time and factored as a band.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +105,7 @@ class Reduction:
     misfit: float = 1.0
 
     @classmethod
-    def of(cls, part: Nodes, numbers: Array, spread: float, noise: Noise) -> Reduction:
+    def of(cls, part: Nodes, numbers: Array, spread: float, noise: Noise) -> Self:
         """Nothing assembled yet."""
         drive = part.drive
         at_s = drive.fix_t_s - numbers[GNSS_DELAY]

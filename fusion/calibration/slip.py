@@ -5,8 +5,6 @@ spread (expectation maximisation), and their expected products the correlation f
 where they are known: a node counts by the share g of its variance that the fixes determine.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ heights measure p, as soon as the distance is long against their own errors, whi
 of the datum, the wandering error, p, and the place of the IMU ahead of the body's origin).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

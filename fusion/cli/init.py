@@ -83,7 +83,7 @@ def init(
         answers = ask(answers, first_log.topics)
         with common.progress_bar("calibrating the sensors") as progress:
             found = first_vehicle(first_log.read, first, answers, progress)
-    _write(out, log, found)
+    _write(out, found)
     print_lines(result_lines(found, out))
     verdict = None if no_verdict else _verdict(found, out)
     lines = ["", *([] if verdict is None else [*verdict.lines(), ""])]
@@ -151,7 +151,7 @@ def _parsed(text: str, name: str) -> Any:
         raise typer.BadParameter(str(error), param_hint=FLAGS[name]) from None
 
 
-def _write(out: Path, log: str, found: FirstVehicle) -> None:
+def _write(out: Path, found: FirstVehicle) -> None:
     from terrafusion.fusion.init.draft import write_draft
     from terrafusion.fusion.outputs.robot_file import seen_from
 

@@ -116,11 +116,6 @@ class EstimatorConfig:
     grounds: GroundMemory | None = None
     terrain_model: TerrainModel | None = None
 
-    @property
-    def longest_wait_s(self) -> float:
-        """How long a start waits for the first fix."""
-        return self.start_without_gnss_s if self.inputs.gnss else 0.0
-
     def __post_init__(self) -> None:
         for key, kind, what, remedy in _KINDS:
             value = getattr(self, key)

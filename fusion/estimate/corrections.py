@@ -1,7 +1,5 @@
 """What an estimator that calibrates itself changed during a drive."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from terrafusion.fusion.estimate.antenna import AntennaPlaces

@@ -1,7 +1,5 @@
 """Aiding sensors of an estimator, barometer and magnetometer; without samples they do nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import gtsam

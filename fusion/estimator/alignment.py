@@ -1,7 +1,5 @@
 """The start: attitude from gravity, or a given pose, and the first state of the graph with its prior."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ warm as the standard's. So a barometer only holds the height of GNSS or of the s
 second count as one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import gtsam

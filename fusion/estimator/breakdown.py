@@ -3,8 +3,6 @@
 It happens where sensors contradict each other, such as an accelerometer in g or wheels in rev/min.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

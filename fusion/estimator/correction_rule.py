@@ -1,7 +1,5 @@
 """Which learned numbers correct a sensor: those that the drive clearly shows to be others than before."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

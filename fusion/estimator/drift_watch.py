@@ -13,8 +13,6 @@ learned: s^2 begins at the sheet's and is scaled by the squares of longer moves 
 falling gain (Robbins and Monro 1951, Ann. Math. Stat. 22(3)).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -7,12 +7,10 @@ est.add_gnss(t_ns, enu_m, sigma_m)
 state = est.latest()
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gtsam
 import numpy as np
@@ -139,7 +137,7 @@ class Estimator:
     @classmethod
     def for_vehicle(
         cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive", sensors: Sensors = None
-    ) -> Estimator:
+    ) -> Self:
         """For a vehicle, given by name, YAML file or itself, with the `sensors` of `sensors_of`."""
         params = as_vehicle(vehicle)
         return cls(EstimatorConfig(params.rig(), params.name, mode, inputs=sensors_of(sensors)))
@@ -255,7 +253,7 @@ class Estimator:
         return snapshot.dump(self)
 
     @classmethod
-    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Self:
         """An estimator that continues from `dump` with the same bits; see `snapshot.restore`."""
         return snapshot.restore(cls(config, **callbacks), data)
 
@@ -381,12 +379,6 @@ class Estimator:
         self.monitor.watch(t_ns, chain.state(chain.last), self.chain.covariance[VELOCITY, VELOCITY], rolled_m)
         return self._emitted(t_ns, gyro)
 
-    @property
-    def _reported_covariance(self) -> Array:
-        """Covariance (dim, dim) of the newest keyframe, with the doubt of antenna and delay of the fixes."""
-        R = self.chain.state(self.chain.last).rotation
-        return self._place_doubt.widened(self.chain.covariance, R, self.learned.place_moments())
-
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
         fresh, self._fresh = self._fresh, None
@@ -429,7 +421,8 @@ class Estimator:
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self._step_ns * 1e-9, self.weights.noise)
         aided = not (self.gnss.local or self.gnss.is_outage(t_ns))
         self._place_doubt.step(t_ns, key, float(key.rate(gyro)[2]), aided)
-        covariance = self._reported_covariance
+        moments = self.learned.place_moments()
+        covariance = self._place_doubt.widened(self.chain.covariance, key.rotation, moments)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),

@@ -1,7 +1,5 @@
 """The samples of a recording that an estimator is given, in the order in which they would come live."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import time

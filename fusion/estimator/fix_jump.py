@@ -5,10 +5,9 @@ there: to cover the step between two fixes, and to move before and after it as t
 an acceleration that no ground gives. A skid needs time: it grows while the robot drives.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
+from typing import Self
 
 from terrafusion.fusion.estimator.dead_reckoning import FixPair
 
@@ -43,7 +42,7 @@ class FixJump:
     @classmethod
     def of(
         cls, before: list[FixPair], after: list[FixPair], heading: complex, scale: float, white: float
-    ) -> FixJump | None:
+    ) -> Self | None:
         """The jump between used and rejected fixes; None where the offsets are small, or grow as in a skid.
 
         Sigmas are taken times `scale`; `white` is the share of their squares that is white.
@@ -71,9 +70,9 @@ class FixJump:
         most_m = 0.25 * MOST_MPS2 * step_s**2 + stamps_m + 3.0 * noise_m
         return cls(offset_m, heading, no_skid or beyond_m > most_m)
 
-    def continued(self, last: FixPair, pair: FixPair, scale: float) -> bool:
+    def continued(self, last: FixPair, pair: FixPair) -> bool:
         """Whether a fix follows the `last` one held off along the path."""
-        near_m = SAME_PLACE * abs(self.offset_m) + scale * math.hypot(last.sigma_m, pair.sigma_m)
+        near_m = SAME_PLACE * abs(self.offset_m) + math.hypot(last.sigma_m, pair.sigma_m)
         return abs(residual_m(last, pair, self.heading)) < near_m
 
 

@@ -1,8 +1,7 @@
 """The keyframe of a fix, and the motion of the antenna between both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -39,7 +38,7 @@ class AntennaMotion:
     velocity_mps: Array
 
     @classmethod
-    def of(cls, chain: Chain, k: int, fix: GnssFix, antenna_m: Array) -> AntennaMotion:
+    def of(cls, chain: Chain, k: int, fix: GnssFix, antenna_m: Array) -> Self:
         """At a fix of keyframe k; `antenna_m` without what the chain estimates of it."""
         node, state = chain.node(k), chain.state(k)
         delay_s = float(state.of(GNSS_DELAY))

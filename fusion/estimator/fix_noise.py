@@ -1,7 +1,5 @@
 """The noise of GNSS fixes as they show it: which part is white, which drifts, and how large both are."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

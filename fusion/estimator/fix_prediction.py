@@ -1,10 +1,9 @@
 """A fix against its prediction by the state of its keyframe."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -51,7 +50,7 @@ class PredictedFix:
     @classmethod
     def of(
         cls, chain: Chain, k: int, fix: GnssFix, antenna_m: Array, white_m: Array, share: float, all_m: Array
-    ) -> PredictedFix:
+    ) -> Self:
         """By the estimate of the chain; `antenna_m` without what that estimates of it.
 
         `white_m` and `all_m` are 1 sigma (3,) of the white errors and of all, `share` is that of the drift.
@@ -84,7 +83,7 @@ class PredictedFix:
             white_share,
         )
 
-    def weighted(self, scale: float, weight: float) -> PredictedFix:
+    def weighted(self, scale: float, weight: float) -> Self:
         """With `scale` times the horizontal sigma, and the weight of a robust loss."""
         sigma = self.position.sigma_m
         S_m2 = self.S_m2 + np.diag((scale**2 - 1.0) * sigma[:2] ** 2)

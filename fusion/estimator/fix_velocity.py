@@ -1,7 +1,5 @@
 """The velocity of a fix as a factor of the keyframe after it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ likelihood (multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6). Th
 displacement and acceleration from the friction model instead of the wheels.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque
@@ -336,9 +334,7 @@ def friction_estimator(
 
 
 def _density2(rate_m2ps: float) -> float:
-    """Squared density of an acceleration whose displacement after `SKID_S` is as uncertain as a walk of
-    `rate_m2ps`.
-    """
+    """Squared density of an acceleration that is as uncertain after `SKID_S` as a walk of `rate_m2ps`."""
     return 3.0 * rate_m2ps / SKID_S**2
 
 

@@ -1,7 +1,5 @@
 """Gates: tests that keep wrong measurements out without locking good ones out."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 from enum import Enum

@@ -1,7 +1,5 @@
 """GNSS fixes on their way into the chain: timing, gates, weights."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque
@@ -295,9 +293,7 @@ class GnssUpdater:
         return True
 
     def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:
-        """Turn the whole window where motion and fixes agree on another heading than the filter's; True when
-        it turned.
-        """
+        """Turn the window where motion and fixes agree on another heading; True when it turned."""
         fix, self._unchecked = self._unchecked, None
         if fix is None:
             return False

@@ -13,13 +13,7 @@ from scipy.linalg import solveh_banded
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned
-from terrafusion.fusion.calibration.numbers import (
-    ANTENNA_X,
-    ANTENNA_Y,
-    GNSS_DELAY,
-    GYRO_BIAS,
-    NUMBERS,
-)
+from terrafusion.fusion.calibration.numbers import ANTENNA_X, ANTENNA_Y, GNSS_DELAY, GYRO_BIAS, NUMBERS
 from terrafusion.fusion.estimator.alignment import KnownStart, Start
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream

@@ -1,7 +1,5 @@
 """The states of a run, collected, smoothed, and turned into an `Estimate`."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 
@@ -94,11 +92,7 @@ class History:
             self.states = [rounded(gnss.open_heading.widened(state)) for state in self.states]
 
     def estimate(
-        self,
-        classes: tuple[str, ...],
-        changes: list[WeightChange],
-        notes: tuple[str, ...],
-        start_ns: int = 0,
+        self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...], start_ns: int = 0
     ) -> Estimate:
         """All keyframes as arrays along time, of a recording that began at `start_ns`."""
         states = self.states

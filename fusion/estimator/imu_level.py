@@ -1,7 +1,5 @@
 """A tilted IMU: roll and pitch of its mounting, learned from turns and heights, corrected where clear."""
 
-from __future__ import annotations
-
 import cmath
 import dataclasses
 import math

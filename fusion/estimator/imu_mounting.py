@@ -3,9 +3,8 @@
 `imu_level` learns its tilt.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Self
 
 import numpy as np
 
@@ -54,7 +53,7 @@ class ImuMounting:
         self.before = self.known = before
         self._imu.mounting_rad = before.rad
 
-    def start_as(self, other: ImuMounting) -> None:
+    def start_as(self, other: Self) -> None:
         """Begin with all angles as another one has them by now."""
         self.start_from(other.known)
         self.level.start_from(other.level.known)

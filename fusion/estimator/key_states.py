@@ -1,7 +1,5 @@
 """From the state of a keyframe in the graph to the reported `State`, and back."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any

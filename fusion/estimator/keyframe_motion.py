@@ -1,7 +1,5 @@
 """What IMU and wheels measured from one keyframe to the next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig

@@ -1,9 +1,8 @@
 """Self-calibration as the estimator uses it: which numbers it learns, and where they go."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
+from collections import deque
 
 import gtsam
 import numpy as np
@@ -29,7 +28,6 @@ from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.corrections import Corrections
 from terrafusion.fusion.estimator.alignment import Start
-from terrafusion.fusion.estimator.before_skid import KnownBeforeSkid
 from terrafusion.fusion.estimator.correction_rule import CORRECTED, CorrectionRule, wheels_roll
 from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
 from terrafusion.fusion.estimator.gnss import GnssUpdater
@@ -62,6 +60,10 @@ ANTENNA_STATES = [NAV.stop + LINEAR.index(name) for name in ("antenna_x_m", "ant
 """Of `--calibrate`, in a keyframe."""
 
 
+SKID_DETECTION_NS, STEPS_KEPT = 15_000_000_000, 8
+"""A skid shows within this time (assumed); so many steps of learning reach further back."""
+
+
 @dataclasses.dataclass(frozen=True)
 class NumberAfterDrive:
     """A number after a drive, its 1 sigma before and after; `corrects`: a sensor is corrected by it."""
@@ -71,6 +73,33 @@ class NumberAfterDrive:
     sigma: float
     prior_sigma: float
     corrects: bool
+
+
+class KnownBeforeSkid:
+    """The last steps of learning, and what was known before the skid under way, in which wheels tell wrong
+    numbers.
+
+    Attributes:
+        held: what was known before it; None while the robot does not skid.
+    """
+
+    def __init__(self) -> None:
+        self.held: Knowledge | None = None
+        self._steps = deque[tuple[int, Knowledge]](maxlen=STEPS_KEPT)
+
+    def learned(self, t_ns: int, known: Knowledge) -> None:
+        """A step of learning that ended at `t_ns`."""
+        self._steps.append((t_ns, known))
+
+    def at(self, t_ns: int, otherwise: Knowledge) -> Knowledge:
+        """What was known before a skid that shows at `t_ns` began; `otherwise` if no step is as old."""
+        until_ns = t_ns - SKID_DETECTION_NS
+        return next((known for at_ns, known in reversed(self._steps) if at_ns <= until_ns), otherwise)
+
+    def clear(self) -> None:
+        """Learning begins anew."""
+        self.held = None
+        self._steps.clear()
 
 
 class LearnedNumbers:
@@ -142,9 +171,7 @@ class LearnedNumbers:
         learning.drive(t_ns, mean.rolled_m, turn_rad, place, yaw_rad, mean.course_rad)
 
     def advance(self, chain: Chain) -> None:
-        """A slice of learning's work; correct the sensors from the newest keyframe on when it gives new
-        numbers.
-        """
+        """A slice of learning's work; new numbers correct the sensors from the newest keyframe on."""
         learning = self.calibration
         if learning is None or not learning.advance():
             return

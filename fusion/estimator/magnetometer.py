@@ -11,8 +11,6 @@ its heading that of the graph within the sigmas of both. Where it is rejected fo
 reset; after more than `CHANCES` resets the sensor is left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ Until fixes come the path is local: its start and heading are arbitrary. Wheels 
 is turned and shifted as a whole. States already reported stay as they are.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 
@@ -59,11 +57,7 @@ class MapAlignment:
 
 
 def align_to_map(
-    chain: Chain,
-    track: DeadReckoning,
-    fix: GnssFix,
-    antenna_m: Array,
-    drift_sigma_m: float,
+    chain: Chain, track: DeadReckoning, fix: GnssFix, antenna_m: Array, drift_sigma_m: float
 ) -> MapAlignment | None:
     """Align the window with the map once the heading on it is known to `YAW_SIGMA_RAD`; else None."""
     fit = track.fit(1.0, YAW_SIGMA_RAD)

@@ -1,7 +1,5 @@
 """What wheels and IMU measured on average from one keyframe to the next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.arrays import Array

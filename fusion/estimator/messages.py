@@ -1,7 +1,5 @@
 """Messages of a recording or a driver as an estimator takes them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable
@@ -76,10 +74,6 @@ def _command(message: CommandSample, _: EstimatorConfig) -> Arguments | None:
     return (v_mps,) if math.isfinite(v_mps) else None
 
 
-def _barometer(message: BarometerSample, _: EstimatorConfig) -> Arguments:
-    return (message.pressure_pa,)
-
-
 def _terrain(message: TerrainSample, config: EstimatorConfig) -> Arguments | None:
     if message.probabilities is None or message.source in TRUE_SOURCES:
         return None
@@ -119,7 +113,7 @@ _READERS: dict[type, tuple[str, Callable[..., Arguments | None]]] = {
     GnssSample: ("add_gnss", _gnss),
     CommandSample: ("add_command", _command),
     SteeringSample: ("add_steering", _steering),
-    BarometerSample: ("add_pressure", _barometer),
+    BarometerSample: ("add_pressure", lambda message, _: (message.pressure_pa,)),
     TerrainSample: ("add_terrain", _terrain),
 }
 

@@ -1,7 +1,5 @@
 """Notes on how an estimator used its inputs, in sentences."""
 
-from __future__ import annotations
-
 from terrafusion.datasets.core.printable import counted, times
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.gnss import GnssUpdater

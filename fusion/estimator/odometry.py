@@ -13,8 +13,6 @@ with the preintegrated dR, dp, dv, whose own covariance is added. Wheels take no
 most `wheel_wait_s` and one step behind the IMU.
 """
 
-from __future__ import annotations
-
 import bisect
 import dataclasses
 import math

@@ -4,8 +4,6 @@ The estimate in `map` jumps where fixes correct it. In `odom` each step is the o
 fixes at its end are used; the path drifts, but it is continuous.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import gtsam

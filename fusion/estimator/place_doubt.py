@@ -6,8 +6,6 @@ place at R a, and a course that lags by l more the heading at -l w (sensitivitie
 Schmidt 1966, Adv. Control Systems 3). Without fixes the place moves on with the heading.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

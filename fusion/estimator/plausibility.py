@@ -7,12 +7,11 @@ believed only once the fixes there have traced, over tens of metres and seconds,
 describe; until then, and for a while after, the covariance spans both places.
 """
 
-from __future__ import annotations
-
 import cmath
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
@@ -88,7 +87,7 @@ class FixRun:
 
     def follows(self, pair: FixPair) -> bool:
         """Whether a fix continues the jump of the run."""
-        return self.jump is not None and self.jump.continued(self.pairs[-1], pair, 1.0)
+        return self.jump is not None and self.jump.continued(self.pairs[-1], pair)
 
     def append(self, pair: FixPair) -> None:
         """Continue the run."""
@@ -377,7 +376,7 @@ class PathShape:
     path_m: float = 0.0
 
     @classmethod
-    def of(cls, pairs: list[FixPair], scale: float = 1.0) -> PathShape:
+    def of(cls, pairs: list[FixPair], scale: float = 1.0) -> Self:
         """The shape of fixes, their sigmas times `scale`."""
         if len(pairs) < SHAPE_FIXES:
             return cls()

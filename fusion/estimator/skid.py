@@ -9,8 +9,6 @@ accepted fixes (Mehra 1972, IEEE T-AC 17(5)). The velocity is wrong, too: its si
 leads to the rejected fixes.
 """
 
-from __future__ import annotations
-
 import math
 
 import gtsam

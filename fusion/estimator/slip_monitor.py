@@ -8,8 +8,6 @@ A robot is immobilised where its wheels turn and it stays ("traction lost"), or 
 and neither wheels nor robot move ("motors stalled"; at the wheels alone a stall looks like a stop).
 """
 
-from __future__ import annotations
-
 import bisect
 import math
 from typing import NamedTuple

@@ -16,14 +16,12 @@ Other measurements of s shrink its error and c alike (`state_updated`) and leave
 filter does; motion adds to P_s alone.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 
@@ -73,7 +71,7 @@ class SlowBias:
     cross: Array
 
     @classmethod
-    def of(cls, mean: Array, sigma: Array) -> SlowBias:
+    def of(cls, mean: Array, sigma: Array) -> Self:
         """A bias of which only the prior (n,) is known."""
         return cls(mean.astype(float), np.diag(np.square(sigma.astype(float))), np.zeros(len(mean)))
 

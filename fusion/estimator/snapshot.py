@@ -9,13 +9,13 @@ Layout: `MAGIC`, SHA-256 of the rest (32 bytes), length of the tree (8 bytes, li
 UTF-8, the arrays end to end.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib
 import json
 import sys
+import types
+import typing
 from collections import deque
 from enum import Enum
 from importlib import metadata
@@ -27,7 +27,6 @@ import numpy as np
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.estimator.annotations import fits, hints_of
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factor_numbers import FactorNumbers, factor_from, numbers_of
@@ -327,10 +326,10 @@ def _parts(value: object) -> dict[str, Any]:
 
 def _misfit(cls: type, parts: dict[str, Any], of_fresh: dict[str, Any]) -> str | None:
     """The first part whose type differs from the class's annotations or from a fresh object's."""
-    hints = hints_of(cls) if dataclasses.is_dataclass(cls) else {}
+    hints = _hints_of(cls) if dataclasses.is_dataclass(cls) else {}
     for name, value in parts.items():
         own = of_fresh.get(name)
-        if name in hints and not fits(value, hints[name]):
+        if name in hints and not _fits(value, hints[name]):
             return name
         if isinstance(own, np.ndarray) and own.shape != np.shape(value):
             return name
@@ -339,6 +338,36 @@ def _misfit(cls: type, parts: dict[str, Any], of_fresh: dict[str, Any]) -> str |
         ):
             return name
     return None
+
+
+@functools.cache
+def _hints_of(cls: type) -> dict[str, Any]:
+    """The annotations of a class, evaluated."""
+    return typing.get_type_hints(cls)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether `value` is of the annotated type; containers are looked into, arrays by kind only."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return True
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if hint is None or hint is type(None):
+        return value is None
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is typing.Annotated:
+        return _fits(value, arguments[0])
+    if not isinstance(value, origin or hint):
+        return False
+    if origin in (list, set) or (origin is tuple and arguments[-1] is Ellipsis):
+        return all(_fits(one, arguments[0]) for one in value)
+    if origin is tuple:
+        return len(value) == len(arguments) and all(map(_fits, value, arguments))
+    if origin is dict:
+        return all(_fits(k, arguments[0]) and _fits(v, arguments[1]) for k, v in value.items())
+    return True
 
 
 def _frozen(cls: type) -> bool:

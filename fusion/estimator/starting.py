@@ -1,19 +1,12 @@
 """The start of an estimator: waits until heading is known, or until GNSS has been waited for long enough."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.aiding import AidingSensors
-from terrafusion.fusion.estimator.alignment import (
-    WINDOW_NS,
-    KnownStart,
-    Start,
-    level_start,
-)
+from terrafusion.fusion.estimator.alignment import WINDOW_NS, KnownStart, Start, level_start
 from terrafusion.fusion.estimator.fix_noise import WHITE_SHARE
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.heading_from_motion import MotionDoubt, MotionStart, heading_from_motion
@@ -73,7 +66,8 @@ class StartSearch:
         now_ns = imu.t_ns[-1]
         # Fixes of another time, as of a receiver whose clock is wrong, are as none: they show no motion.
         if not any(begin <= fix.t_ns <= now_ns + JUMP_NS for fix in self._gnss.waiting):
-            if not last and (now_ns - begin) * 1e-9 <= self._config.longest_wait_s:
+            wait_s = self._config.start_without_gnss_s if self._config.inputs.gnss else 0.0
+            if not last and (now_ns - begin) * 1e-9 <= wait_s:
                 return None
             self._gnss.local = True
             return self.level

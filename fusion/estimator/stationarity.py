@@ -10,8 +10,6 @@ The noise in the test is that of the data sheet, or the vibration from differenc
 that a ride on a lorry is no rest.
 """
 
-from __future__ import annotations
-
 import bisect
 import math
 

@@ -144,16 +144,13 @@ class SteeredTurn:
         distance = increment.distance_m
         H = np.array([curvature_per_m, 1.0])
         turn = distance * float(curvature_per_m + H @ self.mean)
-        own = self._slipping(curvature_per_m) ** 2
+        own = (CURVATURE_SHARE * abs(curvature_per_m) + self._floor_per_m) ** 2
         spread = math.sqrt(float(H @ self.covariance @ H) + own)
         lasting = math.sqrt(2.0 * CORRELATED_S / dt_s)
         sigma = abs(distance) * spread * lasting + 1e-4
         if abs(distance) > LEAST_M:
             self._learn(increment.yaw_rad - turn, distance * H, dt_s, rate_sigma_radps, own, lasting)
         return dataclasses.replace(increment, turn_rad=turn, sigma=np.append(increment.sigma[:3], sigma))
-
-    def _slipping(self, curvature_per_m: float) -> float:
-        return CURVATURE_SHARE * abs(curvature_per_m) + self._floor_per_m
 
     def _learn(
         self, innovation_rad: float, H: Array, dt_s: float, rate_sigma: float, own: float, lasting: float

@@ -1,7 +1,5 @@
 """Replaces a yaw gyro whose reading is stuck, while the wheels show another turn, by the wheels."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -7,8 +7,6 @@ like slip: of two sensors of a change of speed the one that is believed too much
 variables; Fuller 1987, Measurement Error Models, ch. 1).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

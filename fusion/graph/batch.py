@@ -103,9 +103,7 @@ class BatchSmoother:
         return out
 
     def linearise(self) -> float:
-        """Linearise and eliminate everything at the present values; the sum of squares of all whitened
-        residuals.
-        """
+        """Linearise and eliminate at the present values; the sum of squares of all whitened residuals."""
         return self._linearise(self.values, self.linear)
 
     def _linearise(self, values: gtsam.Values, linear: Array) -> float:

@@ -24,7 +24,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import NAV, VELOCITY, KeyState, dim_of
+from terrafusion.fusion.graph.key_state import DIM, NAV, ON_DEMAND, VELOCITY, KeyState
 from terrafusion.fusion.graph.keyframe_rows import carried_prior, link_rows, measured_rows, own_rows
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import (
@@ -57,7 +57,7 @@ class Chain:
 
     def __init__(self, archive: "Chain | None" = None, calibrate: bool = False) -> None:
         self.archive = archive
-        self.dim = dim_of(calibrate)
+        self.dim = DIM if calibrate else DIM - len(ON_DEMAND)
         self.first = 0
         self.nodes: list[Node] = []
         self.values = gtsam.Values()
@@ -138,9 +138,7 @@ class Chain:
         return self.nodes[k - self.first]
 
     def at_or_after(self, t_ns: int) -> int | None:
-        """The first keyframe held at or after a time; None when there is none, or when older ones were
-        dropped.
-        """
+        """The first keyframe at or after a time; None when there is none, or older ones were dropped."""
         i = bisect.bisect_left(self.nodes, t_ns, key=lambda node: node.t_ns)
         if i == len(self.nodes) or (i == 0 and self.nodes[0].t_ns != t_ns):
             return None

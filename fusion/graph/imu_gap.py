@@ -6,8 +6,6 @@ The scale of their turn was learned beside the gyro. Its error, a share of the t
 white noise of sqrt(2 T) times its rate.
 """
 
-from __future__ import annotations
-
 import math
 
 import gtsam

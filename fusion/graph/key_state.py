@@ -161,11 +161,6 @@ def linear_sigma(P: Array) -> Array:
     return out
 
 
-def dim_of(calibrate: bool) -> int:
-    """Length of the tangent, with or without the states of a calibration."""
-    return DIM if calibrate else DIM - len(ON_DEMAND)
-
-
 def cross(a: Array, b: Array) -> Array:
     """a x b of two vectors (3,), in a tenth of `np.cross`'s time."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()

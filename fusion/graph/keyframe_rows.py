@@ -122,9 +122,7 @@ def _fill_navigation(rows: Array, packed: Array, before: Node, node: Node) -> No
 
 
 def carried_prior(rows: Array, offset: Array) -> Array:
-    """Rows (m, dim + 1) of a prior at a state that lies `offset` (`KeyState.local`) from where they were
-    made.
-    """
+    """Rows (m, dim + 1) of a prior at a state that lies `offset` (`KeyState.local`) from their own."""
     dim = rows.shape[1] - 1
     out = rows.copy()
     out[:, dim] -= rows[:, :dim] @ offset[:dim]

@@ -1,7 +1,5 @@
 """Distance of the axles of a robot that steers, by its steering angles and the gyro."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from terrafusion.datasets.core.recording import Recording

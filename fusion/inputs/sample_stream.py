@@ -34,8 +34,7 @@ class Lateness:
         self.too_late = 0
 
     def from_future(self, t_ns: int, times: list[int]) -> int:
-        """How many of the newest samples, fewer than show a jump, have times that were wrong; before the
-        start only."""
+        """How many of the newest samples, too few for a jump, have wrong times; before the start only."""
         if self.used_ns is not None:
             return 0
         ahead = len(times) - bisect.bisect_right(times, t_ns + JUMP_NS)

@@ -56,9 +56,7 @@ class SteeringStream(SampleStream):
         return self._mean(self.per_m, start_ns, end_ns)
 
     def course_rad(self, start_ns: int, end_ns: int) -> float:
-        """Mean angle from the body's x axis to that point's velocity, positive to the left; 0 where no angle
-        is near.
-        """
+        """Mean angle of that point's velocity from body x, positive to the left; 0 without an angle near."""
         return math.atan(self._mean(self.course, start_ns, end_ns) or 0.0)
 
     def _mean(self, values: list[float], start_ns: int, end_ns: int) -> float | None:

@@ -361,7 +361,8 @@ class LiveNode:
                 self.reset(f"the estimator failed: {error}")
                 return
             if isinstance(message, ImuSample):
-                if estimator.config.inputs.imu == "six_axis" and not _is_complete(message):
+                complete = math.isfinite(sum(message.gyro_radps.tolist()) + sum(message.accel_mps2.tolist()))
+                if estimator.config.inputs.imu == "six_axis" and not complete:
                     self._refuse("imu", DataError(f"a sample lacks numbers: {message[1:]}"))
                 self._publish_state(estimator)
 
@@ -436,10 +437,6 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
             remedy=DATUM,
         )
     return latitude, longitude, height_m
-
-
-def _is_complete(sample: ImuSample) -> bool:
-    return math.isfinite(sum(sample.gyro_radps.tolist()) + sum(sample.accel_mps2.tolist()))
 
 
 def _is_number(text: str) -> bool:

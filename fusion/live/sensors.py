@@ -6,7 +6,6 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.conventions import BODY_AXES
 from terrafusion.datasets.core.errors import DataError
@@ -85,7 +84,8 @@ def find_sensors(
             notes.append(mounting_note(kind, frame, found))
     turn = None
     if "imu" in mounted and tells_turn(mounted["imu"], _frame(gathered, chosen["imu"]), request.rig):
-        turn, request = mounted["imu"][1], _without_axes(request)
+        R, request = mounted["imu"][1], _without_axes(request)
+        turn = None if np.array_equal(R, np.eye(3)) else R
     # Stamps out of order are no reason to wait: only the kinds of sensors are taken from this recording.
     repairing = dataclasses.replace(request, repair_clock=True)
     try:
@@ -98,7 +98,7 @@ def find_sensors(
         return f"one message of {chosen['imu'].name} yet; the next one shows how fast it is"
     overrides = with_mountings(recording.overrides, mounted, request.rig)
     recording = dataclasses.replace(recording, overrides=overrides)
-    arriving = ArrivingMessages(request, chosen, datum or recording.datum, _if_turned(turn))
+    arriving = ArrivingMessages(request, chosen, datum or recording.datum, turn)
     notes = [*(f"{kind}: {topic.name} ({topic.msgtype})" for kind, topic in chosen.items()), *notes]
     return Sensors(recording, arriving, [*notes, *recording.notes])
 
@@ -133,7 +133,3 @@ def _without_axes(request: Request) -> Request:
     sensors = request.rig.sensors
     sensors = dataclasses.replace(sensors, imu=dataclasses.replace(sensors.imu, axes=BODY_AXES))
     return dataclasses.replace(request, rig=dataclasses.replace(request.rig, sensors=sensors))
-
-
-def _if_turned(R: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    return None if R is None or np.array_equal(R, np.eye(3)) else R

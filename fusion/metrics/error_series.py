@@ -98,23 +98,16 @@ def errors_against_truth(estimate: Estimate, recording: Recording, antenna: Ante
     if not len(t_ns) or not (has_position or has_yaw or has_velocity):
         return None
     point = antenna if recording.truth_frame == "antenna" else AntennaPlaces.fixed((0.0, 0.0, 0.0))
-    position, velocity, covariance, yaw, yaw_sigma, R = _point_at(estimate, t_ns, point)
-    nothing = np.full(len(t_ns), np.nan)
-    reference = truth.positions_at(t_ns)[:, :2] if has_position else np.full((len(t_ns), 2), np.nan)
-    moved = np.full((len(t_ns), 2), np.nan)
+    errors, velocity, R = _without_reference(estimate, t_ns, point)
+    if has_position:
+        errors = dataclasses.replace(errors, reference_m=truth.positions_at(t_ns)[:, :2])
+    if has_yaw:
+        errors = dataclasses.replace(errors, reference_yaw_rad=_yaw_at(truth, t_ns))
     if has_velocity and truth.twist_body is not None:
         body = np.einsum("nji,nj->ni", R, velocity)
         moved = body[:, :2] - _interpolate(t_ns, truth.t_ns, truth.twist_body[:, :2])
-    return Errors(
-        t_ns=t_ns,
-        estimate_m=position,
-        reference_m=reference,
-        estimate_yaw_rad=yaw,
-        reference_yaw_rad=_yaw_at(truth, t_ns) if has_yaw else nothing,
-        velocity_error_mps=moved,
-        covariance_m2=covariance,
-        yaw_sigma_rad=yaw_sigma,
-    )
+        errors = dataclasses.replace(errors, velocity_error_mps=moved)
+    return errors
 
 
 def errors_against_fixes(estimate: Estimate, held_out: Gnss | None, antenna: AntennaPlaces) -> Errors | None:
@@ -133,21 +126,16 @@ def errors_against_fixes(estimate: Estimate, held_out: Gnss | None, antenna: Ant
     fixes = held_out.select(valid & inside & _bracketed(held_out.t_ns, grid))
     if not len(fixes):
         return None
-    position, velocity, covariance, yaw, yaw_sigma, _ = _point_at(estimate, fixes.t_ns, antenna)
+    errors, velocity, _ = _without_reference(estimate, fixes.t_ns, antenna)
     variance = fixes.sigma_enu_m[:, :2] ** 2
-    moved = np.full((len(fixes), 2), np.nan)
     if fixes.velocity_enu_mps is not None:
         moved = velocity[:, :2] - fixes.velocity_enu_mps[:, :2]
+        errors = dataclasses.replace(errors, velocity_error_mps=moved)
     noise_m = float(np.median(fixes.sigma_enu_m[:, :2])) if np.isfinite(variance).all() else 0.0
-    return Errors(
-        t_ns=fixes.t_ns,
-        estimate_m=position,
+    return dataclasses.replace(
+        errors,
         reference_m=fixes.enu_m[:, :2],
-        estimate_yaw_rad=yaw,
-        reference_yaw_rad=np.full(len(fixes), np.nan),
-        velocity_error_mps=moved,
-        covariance_m2=covariance + variance[:, :, None] * np.eye(2),
-        yaw_sigma_rad=yaw_sigma,
+        covariance_m2=errors.covariance_m2 + variance[:, :, None] * np.eye(2),
         min_step_m=max(MIN_STEP_M, 3.0 * noise_m),
     )
 
@@ -200,11 +188,11 @@ def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
     return selected, notes
 
 
-def _point_at(
+def _without_reference(
     estimate: Estimate, t_ns: TimesNs, point: AntennaPlaces
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Position (M, 2), world velocity (M, 3) and position covariance (M, 2, 2) of a body-fixed point;
-    yaw and its sigma (M,) and rotation to the world (M, 3, 3) of the body."""
+) -> tuple[Errors, Array, Array]:
+    """The series of a body-fixed point whose reference is unknown; the point's world velocity (M, 3), and the
+    rotation to the world (M, 3, 3) of the body."""
     path = estimate.trajectory
     nearest = np.searchsorted((path.t_ns[1:] + path.t_ns[:-1]) // 2, t_ns)
     quaternion = path.quaternions_at(t_ns)
@@ -227,8 +215,18 @@ def _point_at(
         J[:, 1, 3], J[:, 1, 5] = -arm[:, 2], arm[:, 0]
         covariance = J @ P @ np.swapaxes(J, 1, 2)
         yaw_sigma = np.sqrt(np.maximum(P[:, 5, 5], 0.0))
-    position = (path.positions_at(t_ns) + arm)[:, :2]
-    return position, velocity, covariance, yaw_of(quaternion), yaw_sigma, R
+    unknown = np.full((len(t_ns), 2), np.nan)
+    errors = Errors(
+        t_ns=t_ns,
+        estimate_m=(path.positions_at(t_ns) + arm)[:, :2],
+        reference_m=unknown,
+        estimate_yaw_rad=yaw_of(quaternion),
+        reference_yaw_rad=unknown[:, 0],
+        velocity_error_mps=unknown,
+        covariance_m2=covariance,
+        yaw_sigma_rad=yaw_sigma,
+    )
+    return errors, velocity, R
 
 
 def _yaw_at(truth: Trajectory, t_ns: TimesNs) -> Array:

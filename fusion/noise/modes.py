@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
@@ -88,8 +87,7 @@ class ModesFile(ModeTuning):
 
 @functools.cache
 def _shipped() -> ModeTuning:
-    with resources.as_file(resources.files("terrafusion.fusion.noise") / "modes.yaml") as path:
-        return load_modes(path)
+    return load_modes(Path(__file__).with_name("modes.yaml"))
 
 
 def load_modes(path: Path | None = None) -> ModeTuning:

@@ -9,7 +9,6 @@ import dataclasses
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
@@ -145,8 +144,7 @@ class PolicyFile:
 
 @functools.cache
 def _shipped() -> Policy:
-    with resources.as_file(resources.files("terrafusion.fusion.noise") / "policy.yaml") as path:
-        return load_policy(path)
+    return load_policy(Path(__file__).with_name("policy.yaml"))
 
 
 def load_policy(path: str | Path | None = None) -> Policy:

@@ -6,8 +6,6 @@ report.html      tables and figure in one page
 parts/           the rows of single jobs, from which a stopped run continues
 """
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 from collections.abc import Mapping, Sequence

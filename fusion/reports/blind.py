@@ -1,7 +1,5 @@
 """`report.html` of a blind check, and its summary as text."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The files of a calibration: `calibration.json`, the corrected YAML files and `report.html`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

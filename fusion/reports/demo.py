@@ -1,7 +1,5 @@
 """Several drives of the demo in one picture, one table and one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -83,16 +81,12 @@ def where_it_does_not_help(table: Table) -> str:
     end = table["at the end of the outage"]
     pairs = list(zip(end[ADAPTIVE], end[FIXED], strict=True))
     lost = sum(a > b for a, b in pairs)
-    parts = [f"they equal fixed ones {_listed(even)}"] if even else []
-    parts += [f"they are worse {_listed(worse)}"] if worse else []
+    parts = [f"they equal fixed ones {' and '.join(even)}"] if even else []
+    parts += [f"they are worse {' and '.join(worse)}"] if worse else []
     parts += [f"{lost} of {len(pairs)} drives end the outage with a larger error"] if lost else []
     if not parts:
         return "Adaptive weights help in every drive shown here; on firm ground they equal fixed ones."
     return f"Where adaptive weights do not help: {'; '.join(parts)}."
-
-
-def _listed(rows: Sequence[str]) -> str:
-    return " and ".join(rows)
 
 
 def plot_drives(sheet: Sheet, runs: Sequence[DemoRun]) -> None:

@@ -1,7 +1,5 @@
 """`report.html` of a replay, or of several replays of one drive, and all files of a replay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

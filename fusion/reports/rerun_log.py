@@ -13,11 +13,9 @@ Times are on two timelines: `elapsed` from the start of the recording, and `stam
 The package `rerun-sdk` is an extra and imported only here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +26,9 @@ from terrafusion.fusion.estimate.estimate import STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.outputs.replay_files import is_local
+from terrafusion.fusion.replay import ReplayResult
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, rejected_fixes
-
-if TYPE_CHECKING:
-    from terrafusion.fusion.replay import ReplayResult
-
 
 GNSS_COLOUR, REJECTED_COLOUR, BODY_COLOUR = "#9a9a9a", "#111111", "#0072b2"
 

@@ -1,10 +1,8 @@
 """`report.html` of a sweep."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
@@ -13,9 +11,7 @@ from terrafusion.fusion.reports.page import TWIN_LIBRARIES, Tile, VerdictBox, wr
 from terrafusion.fusion.reports.plots.sheet import Sheet
 from terrafusion.fusion.reports.plots.sweep import LABELS, draw
 from terrafusion.fusion.reports.plots.sweep_cells import varied, with_mobile
-
-if TYPE_CHECKING:
-    from terrafusion.twin.sweep.plan import Sweep
+from terrafusion.twin.sweep.plan import Sweep
 
 MOST_FAILURES = 20
 MEANINGS = {

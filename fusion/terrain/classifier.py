@@ -12,7 +12,6 @@ import dataclasses
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -243,8 +242,7 @@ class TerrainModelFile:
 
 @functools.cache
 def _shipped() -> TerrainModel:
-    with resources.as_file(resources.files("terrafusion.fusion.terrain") / "model.yaml") as path:
-        return load_terrain_model(path)
+    return load_terrain_model(Path(__file__).with_name("model.yaml"))
 
 
 def load_terrain_model(path: Path | None = None) -> TerrainModel:

@@ -1,4 +1,7 @@
-"""`TerrainDetector`: windows in, class probabilities out."""
+"""`TerrainDetector`: windows in, class probabilities out; `SourceCredit` of what a camera says."""
+
+import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -7,7 +10,6 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.terrain.change_alarm import ChangeAlarm
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
-from terrafusion.fusion.terrain.credit import SourceCredit
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.terrain.sequence import PatchFilter
 
@@ -15,6 +17,14 @@ EXTERNAL_TRUST = 0.3
 """Exponent on the evidence of an external source: its frames repeat one another as windows do."""
 EXTERNAL_ERROR = 0.1
 """Share of an external source's answers taken to be arbitrary, so that none excludes a class."""
+FULL_CREDIT = 3.0
+"""Log-odds at the start, and at most; then the source is believed without reserve."""
+LEAST_CREDIT = -60.0
+"""Log-odds at least: a source that was wrong for long is believed again after about a minute."""
+MOST_LOSS = 4.0
+"""Most log-odds that one window takes: a ground of a class may be another than those of its training."""
+AVERAGED_CHECKS = 3
+"""Checks over which claims are averaged: the window spans a change of ground for so long."""
 
 
 class TerrainDetector:
@@ -96,3 +106,52 @@ class TerrainDetector:
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
         self._filter.update(EXTERNAL_TRUST * self.credit.value * np.log(q))
         return self.probabilities
+
+
+class SourceCredit:
+    """Share, 0 to 1, by which a source is believed: the probability that it tells the ground, over that at
+    the start.
+
+    The log-odds of that grow with each window by the Bayes factor of the claimed grounds against grounds
+    drawn at random. A robot that the terrain model does not know checks a claim by its slip alone, while
+    fixes show it.
+
+    Args:
+        k: number of grounds.
+        unknown: index of ground without a class, a claim that cannot be checked.
+    """
+
+    def __init__(self, k: int, unknown: int) -> None:
+        self._drawn, self._unknown = np.full(k, 1.0 / k), unknown
+        self._odds = FULL_CREDIT
+        self._claims: deque[Array] = deque(maxlen=20)
+        self._recent: deque[Array] = deque(maxlen=AVERAGED_CHECKS)
+
+    @property
+    def value(self) -> float:
+        """The share now."""
+        return (1.0 + math.exp(-FULL_CREDIT)) / (1.0 + math.exp(-self._odds))
+
+    @property
+    def has_claims(self) -> bool:
+        """Whether there are claims to check."""
+        return bool(self._claims)
+
+    def claim(self, probabilities: Array) -> None:
+        """What the source says now: probabilities (k,) that sum to one."""
+        self._claims.append(probabilities)
+
+    def check(self, log_likelihood: Array) -> None:
+        """Compare the claims since the last check with the log-likelihoods (k,) of a window."""
+        if not self._claims:
+            return
+        self._recent.append(np.mean(self._claims, axis=0))
+        self._claims.clear()
+        claimed = np.mean(self._recent, axis=0)
+        likelihood = np.exp(log_likelihood - log_likelihood.max())
+        checked = 1.0 - float(claimed[self._unknown])
+        if not checked > 0.5:
+            return
+        borne_out = float(claimed @ likelihood) / float(self._drawn @ likelihood)
+        self._odds += max(math.log(max(borne_out, 1e-9)), -MOST_LOSS)
+        self._odds = min(max(self._odds, LEAST_CREDIT), FULL_CREDIT)

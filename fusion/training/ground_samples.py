@@ -15,8 +15,7 @@ Against the truth of a simulated run, only while the wheels turn:
   yaw rate (the centre of rotation is a state of the estimator).
 - IMU: mean error over tau less its 60 s running mean (the bias), as a multiple of the data sheet's density /
   sqrt(tau). Vibration is band-limited, so the multiple falls with tau; tau is the time over which the
-  estimator
-  integrates the sensor: 2 s for the specific force, 5 s for the rate.
+  estimator integrates the sensor: 2 s for the specific force, 5 s for the rate.
 - GNSS: horizontal error over the reported sigma.
 
 Recorded runs give slip, yaw scale and side-slip only, see `policy_logs`.
@@ -89,13 +88,12 @@ def samples_of(recording: Recording) -> GroundSamples:
     slip = _slip_samples(wheels, grade, vehicle.sensors.wheels.speed_sigma_mps)
     imu = _imu_samples(recording, wheels, R, truth.twist_body, vehicle.sensors.imu)
     gnss = _gnss_samples(recording.gnss, truth, vehicle.sensors.gnss.antenna_m)
-    return GroundSamples(*slip, _yaw_scales(wheels, vehicle.rig().track_m), side_slip, *imu, gnss)
+    yaw_scale = _yaw_scales(wheels, vehicle.rig().track_m)
+    return GroundSamples(**slip, yaw_scale=yaw_scale, side_slip=side_slip, **imu, gnss=gnss)
 
 
-def _slip_samples(
-    samples: WheelSamples, grade: Array, encoder_mps: float
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s not explained by slip."""
+def _slip_samples(samples: WheelSamples, grade: Array, encoder_mps: float) -> dict[str, Array]:
+    """`slips_of` and `wheel_mps`, the speed errors (k,) not explained by slip."""
     wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
     step = float(np.median(np.diff(samples.t_s)))
     short = max(round(SHORT_S / step), 1)
@@ -108,11 +106,11 @@ def _slip_samples(
     residual = (forward - share * wheel)[turning]
     blocks = round(SLIP_S / SHORT_S)
     slips = slips_of(*(_block_means(x, blocks) for x in (wheel, forward, grade)))
-    return *slips, np.hypot(residual, encoder_mps)
+    return slips | {"wheel_mps": np.hypot(residual, encoder_mps)}
 
 
-def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array, Array, Array, Array]:
-    """Slips and grades (n,), and pairs of both (m, 2), of speeds (k,) every `SLIP_S`.
+def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> dict[str, Array]:
+    """`slip` and `grade` (n,), and their pairs (m, 2), as in `GroundSamples`, of speeds (k,) every `SLIP_S`.
 
     Unknown speeds are NaN.
     """
@@ -125,7 +123,12 @@ def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array,
     pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
     grade_pairs = np.stack([grade[:-lag], grade[lag:]], axis=1)
     both = np.isfinite(pairs).all(axis=1)
-    return slip[counted], grade[counted], pairs[both], grade_pairs[both]
+    return {
+        "slip": slip[counted],
+        "grade": grade[counted],
+        "slip_pairs": pairs[both],
+        "grade_pairs": grade_pairs[both],
+    }
 
 
 def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
@@ -160,8 +163,8 @@ def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> 
 
 def _imu_samples(
     recording: Recording, samples: WheelSamples, R: Array, twist: Array, spec: ImuSpec
-) -> tuple[Array, Array, Array]:
-    """Errors of means over the data sheet's: gyro about roll and pitch (2 n,), yaw (n,), accelerometer (m,).
+) -> dict[str, Array]:
+    """Errors of means over the data sheet's: `gyro` (2 n,), `gyro_yaw` (n,), `accel` (m,).
 
     A sample is compared with the rotation and change of velocity over the interval that it ends, by true
     rotations (k, 3, 3) and body twists (k, 6).
@@ -179,11 +182,11 @@ def _imu_samples(
     gyro = imu.gyro_radps - _rotation_vectors(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / step
     accel = imu.accel_mps2 - np.einsum("nji,nj->ni", R[:-1], change)
     speed = np.interp(imu_t, samples.t_s, np.abs(samples.sides_mps).mean(axis=1))
-    return (
-        _relative(gyro[:, :2], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
-        _relative(gyro[:, 2:], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
-        _relative(accel, speed, step, ACCEL_S, spec.accel_noise_mps2_sqrthz),
-    )
+    return {
+        "gyro": _relative(gyro[:, :2], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        "gyro_yaw": _relative(gyro[:, 2:], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        "accel": _relative(accel, speed, step, ACCEL_S, spec.accel_noise_mps2_sqrthz),
+    }
 
 
 def _relative(error: Array, speed_mps: Array, step_s: float, tau_s: float, density: float) -> Array:

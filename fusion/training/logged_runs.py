@@ -1,7 +1,5 @@
 """Windows of labelled logs as the estimator forms them, to train and to score a terrain model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

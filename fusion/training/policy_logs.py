@@ -102,8 +102,8 @@ def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str
         slip = slips_of(motion.wheel_mps, forward, motion.grade)
         yaw = yaw_scales_of(motion.wheel_radps, np.where(here, motion.true_radps, np.nan))
         side = side_slips_of(forward, motion.lateral_mps, motion.true_radps)
-        none = np.empty(0)
-        found[ground] = GroundSamples(*slip, none, yaw, side, none, none, none, none)
+        unseen = dict.fromkeys(("wheel_mps", "gyro", "gyro_yaw", "accel", "gnss"), np.empty(0))
+        found[ground] = GroundSamples(**slip, yaw_scale=yaw, side_slip=side, **unseen)
     return found
 
 

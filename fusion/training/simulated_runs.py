@@ -7,7 +7,6 @@ import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.twin.model.library import read_named
+from terrafusion.twin.model.soil_table import PARAMS
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
@@ -111,12 +111,11 @@ class Grid:
     def fingerprint(self, **settings: Any) -> str:
         """SHA-256 of the soil, scenario and vehicle files of the runs, and of all settings."""
         digest = hashlib.sha256()
-        params = resources.files("terrafusion.twin.params")
         files = {"soils": self.grounds, "scenarios": self.scenarios, "vehicles": (self.vehicle,)}
         for folder, names in files.items():
             for name in sorted(names):
                 digest.update(f"{folder}/{name}\n".encode())
-                digest.update((params / folder / f"{name}.yaml").read_bytes())
+                digest.update((PARAMS / folder / f"{name}.yaml").read_bytes())
         text = json.dumps(
             {"grid": dataclasses.asdict(self), "soil scatter": SOIL_SCATTER, **settings}, sort_keys=True
         )

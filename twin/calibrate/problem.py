@@ -50,10 +50,6 @@ class Point:
         pose = tuple(p + d for p, d in zip(self.pose, dpose, strict=True))
         return Point(self.w + dw, self.errors + derrors, pose)
 
-    def prior_cost(self) -> float:
-        parts = (self.w, self.errors, *self.pose)
-        return 0.5 * sum(float((part**2).sum()) for part in parts)
-
 
 @dataclass(frozen=True, eq=False)
 class ResidualBlock:
@@ -108,10 +104,6 @@ class Normal:
     g: Array
     cost: float
     poses: dict[Key, EliminatedPose]
-
-    def pose_gain(self) -> float:
-        """By how much the steps of the poses alone lower the cost, to first order."""
-        return 0.5 * sum(float(e.gradient @ e.own) for e in self.poses.values())
 
 
 class Problem:
@@ -194,7 +186,7 @@ class Problem:
         P, B, Q = len(self.coordinates), len(self.errors), len(POSE)
         size = P + B * len(self.logs)
         H, g = np.eye(size), np.concatenate([point.w, point.errors.ravel()])
-        cost = point.prior_cost()
+        cost = 0.5 * sum(float((part**2).sum()) for part in (point.w, point.errors, *point.pose))
         poses: dict[Key, EliminatedPose] = {}
         by_window: dict[Key, list[ResidualBlock]] = {}
         for block in blocks:

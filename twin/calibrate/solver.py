@@ -214,4 +214,5 @@ def _step(normal: Normal, held: NDArray[np.bool_], damping: float) -> Array:
 
 def _predicted_gain(normal: Normal, d: Array) -> float:
     """By how much a step lowers the quadratic model of the cost, the steps of the poses included."""
-    return -float(normal.g @ d) - 0.5 * float(d @ normal.H @ d) + normal.pose_gain()
+    by_poses = 0.5 * sum(float(e.gradient @ e.own) for e in normal.poses.values())
+    return -float(normal.g @ d) - 0.5 * float(d @ normal.H @ d) + by_poses

@@ -78,8 +78,7 @@ def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
 
 
 def _dry(q: Quantities, torque: Any) -> dict[str, Any]:
-    """Friction of each wheel's bearings and gears that holds at rest, too: by the bristle of the rolling
-    resistance."""
+    """Friction of bearings and gears that holds at rest, too: by the bristle of the rolling resistance."""
     return {"rolling": q["rolling"] + torque / (q["load_n"] * q["radius_m"])}
 
 

@@ -5,8 +5,6 @@ less it gives way, the faster. An explicit step that is too long does not diverg
 within the give of the ground.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -3,8 +3,6 @@
 data -> rollout -> null -> infer -> answer
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from terrafusion.datasets.core.errors import ConfigError, DataError

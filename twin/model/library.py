@@ -2,22 +2,18 @@
 
 import functools
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.yaml_file import read_yaml
-from terrafusion.twin.model.soil_table import is_published, published_soil
+from terrafusion.twin.model.soil_table import PARAMS, is_published, published_soil
 
 
 def known_names(folder: str) -> tuple[str, ...]:
     """Names (file stems) of the YAML files in `twin/params/<folder>`, sorted."""
-    root = resources.files("terrafusion.twin.params") / folder
-    return tuple(
-        sorted(entry.name.removesuffix(".yaml") for entry in root.iterdir() if entry.name.endswith(".yaml"))
-    )
+    return tuple(sorted(file.stem for file in (PARAMS / folder).glob("*.yaml")))
 
 
 def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dict[str, Any], str]:
@@ -54,8 +50,7 @@ def _is_path(text: str) -> bool:
 @functools.cache
 def _own_file(folder: str, name: str) -> dict[str, Any]:
     """Content of a file of the library, read once; callers do not change it."""
-    with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{name}.yaml") as path:
-        return read_yaml(path)
+    return read_yaml(PARAMS / folder / f"{name}.yaml")
 
 
 def assumed(folder: str, name_or_path: str | Path) -> tuple[int, int]:

@@ -8,12 +8,14 @@ pressure) stands in `params/published_soil.yaml`.
 import csv
 import functools
 import math
-from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.yaml_file import read_yaml
 
+PARAMS = Path(__file__).parents[1] / "params"
+"""Folder of the parameter files that come with the library."""
 _COLUMNS = {
     "k_c_kn_per_m_n1": ("pressure", "k_c_n_per_m_n1", 1e3),
     "k_phi_kn_per_m_n2": ("pressure", "k_phi_n_per_m_n2", 1e3),
@@ -31,8 +33,7 @@ MOISTURE_POINTS = 3.0
 @functools.cache
 def published_soils() -> dict[str, dict[str, str]]:
     """Rows of the table by `collection:name`: the texts of its columns."""
-    path = resources.files("terrafusion.twin.params") / "soil_table.csv"
-    rows = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+    rows = csv.DictReader((PARAMS / "soil_table.csv").read_text(encoding="utf-8").splitlines())
     return {f"{row['collection']}:{row['name']}": row for row in rows}
 
 
@@ -66,5 +67,4 @@ def published_soil(name: str) -> dict[str, Any]:
 
 @functools.cache
 def _unpublished() -> dict[str, dict[str, Any]]:
-    with resources.as_file(resources.files("terrafusion.twin.params") / "published_soil.yaml") as path:
-        return read_yaml(path)
+    return read_yaml(PARAMS / "published_soil.yaml")

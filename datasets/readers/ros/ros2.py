@@ -210,7 +210,6 @@ class Ros2Folder:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
         self._files: list[tuple[BagContainer, dict[int, int]]] = []  # and the ids here by those of the file
         self._scratch = ExitStack()
         self.sources: list[BagSource] = []

@@ -1,7 +1,5 @@
 """Figures of a diagnosis: paths, the gap map, ranked causes, errors before and after the effect is added."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

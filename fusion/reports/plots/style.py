@@ -4,8 +4,6 @@ The colours start from Okabe and Ito (2008, "Color Universal Design"), which rea
 colour blindness can tell apart; terrains that are alike in hue differ in lightness.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Iterable, Sequence

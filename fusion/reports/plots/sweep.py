@@ -3,8 +3,6 @@
 A run is mobile when it drives to the end (status `done`).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

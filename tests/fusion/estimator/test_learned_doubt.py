@@ -23,9 +23,14 @@ from terrafusion.fusion.calibration.numbers import (
     assumed,
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.estimator.before_skid import SKID_DETECTION_NS, KnownBeforeSkid
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.learned_numbers import TURN_TIME_S, _doubt_place, with_turn_doubt
+from terrafusion.fusion.estimator.learned_numbers import (
+    SKID_DETECTION_NS,
+    TURN_TIME_S,
+    KnownBeforeSkid,
+    _doubt_place,
+    with_turn_doubt,
+)
 from terrafusion.fusion.estimator.mean_motion import MeanMotion
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.terrain.classifier import load_terrain_model
-from terrafusion.fusion.terrain.credit import SourceCredit
-from terrafusion.fusion.terrain.detector import TerrainDetector, Window
+from terrafusion.fusion.terrain.detector import SourceCredit, TerrainDetector, Window
 
 K = 4
 UNKNOWN = K - 1

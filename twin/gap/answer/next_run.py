@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -48,8 +48,8 @@ STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothin
 @functools.cache
 def drives() -> dict[str, Scenario]:
     """Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
-    with resources.as_file(resources.files("terrafusion.twin.gap.answer") / "next_drives.yaml") as path:
-        return {name: scenario_of({"drive": d}, str(path), name) for name, d in read_yaml(path).items()}
+    path = Path(__file__).with_name("next_drives.yaml")
+    return {name: scenario_of({"drive": d}, str(path), name) for name, d in read_yaml(path).items()}
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,7 @@ def _explained(information: Array, signal: Array, columns: Sequence[int]) -> flo
 
 
 def forecast_runs(evidence: GapEvidence, names: Sequence[str], effects: set[str]) -> dict[str, WhitenedRun]:
-    """Sensitivities of drives that have not been driven: their errors are zero. None of one on which the twin
-    diverges."""
+    """Sensitivities of drives not yet driven, their errors zero; None of one where the twin diverges."""
     candidates, courses = evidence.candidates, [course_of(evidence, name, effects) for name in names]
     out = dict[str, WhitenedRun]()
     for name, own, run in zip(names, courses, linearise_all(courses, candidates), strict=True):
@@ -194,8 +193,7 @@ def course_of(evidence: GapEvidence, name: str, effects: set[str]) -> Course:
 
 
 def _lifted(model: Model, label: str) -> Model:
-    """The twin with its wheels in the air: the stand carries the body, so that the wheels have neither load
-    nor friction."""
+    """The twin on a stand that carries its body: the wheels have neither load nor friction."""
     firm = load_soil("asphalt")
     shear = dataclasses.replace(firm.shear, friction_angle_rad=1e-6, friction_cap=1e-6)
     air = dataclasses.replace(firm, shear=shear, resistance=dataclasses.replace(firm.resistance, rolling=0.0))

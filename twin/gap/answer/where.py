@@ -63,8 +63,7 @@ class GapCell:
 def gap_map(
     evidence: GapEvidence, sigma: Array, robot: RobotOffsets, significance: float, seed: int
 ) -> list[GapCell]:
-    """All cells with enough samples, those significant first, by their share; none with fewer than
-    `LEAST_REFERENCES`."""
+    """All cells with enough samples, significant ones first, by share; none below `LEAST_REFERENCES`."""
     runs, R = [*evidence.runs, *evidence.references], len(evidence.runs)
     if len(evidence.references) < LEAST_REFERENCES:
         return []

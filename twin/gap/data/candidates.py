@@ -113,8 +113,7 @@ class Candidates:
         return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 
     def bounds(self, columns: Sequence[int]) -> tuple[Array, Array]:
-        """Least and greatest changes (k,) of some columns, in typical sizes: zero where there is no room for
-        `SMALLEST`."""
+        """Least and greatest changes (k,), in typical sizes; zero where there is no room for `SMALLEST`."""
         at = list(columns)
         base, scale = self.base[at], self.scale[at]
         low, high = (RANGE_SHARE * end[at] / scale - base / scale for end in (self.low, self.high))

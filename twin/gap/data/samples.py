@@ -1,7 +1,7 @@
 """Maps each observed sample of a log to the samples of the twin's run that it averages."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -13,7 +13,9 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import averaging
+from terrafusion.twin.effects.sensing import CLOCK_S, IMU
 from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.sensors.effects import CLOCK_DRIFT, DELAYS
 
 Indices = NDArray[np.int64]
 
@@ -50,6 +52,37 @@ def sample_map(log: PreparedLog) -> SampleMap:
         coarse = [_coarse(o, log) for o in log.observed]
         known = _CACHE[log] = SampleMap(blocks, _equally_spaced(log, blocks), fine, coarse)
     return known
+
+
+def delayed_samples(log: PreparedLog, effects: Mapping[str, float]) -> list[tuple[Indices, Array]]:
+    """`SampleMap.fine` of the log with the delays among the effects: an observed sample is made of the twin's
+    run as it was a delay earlier.
+
+    The catalogue's law of a delay is first order, y - e dy/dt: enough for a sensitivity, but wrong for a
+    third of a second. IMU readings continue across windows; positions are reset at each window and are
+    extrapolated before its start.
+    """
+    delays = {key: effects[key] for key in DELAYS if effects.get(key, 0.0) != 0.0}
+    out = list(sample_map(log).fine)
+    for i, observed in enumerate(log.observed):
+        delay_s = _delay_s(observed, delays)
+        if delay_s.any():
+            before = dataclasses.replace(
+                observed, begin_s=observed.begin_s - delay_s, end_s=observed.end_s - delay_s
+            )
+            window = window_of(before if observed.channel in IMU else observed, log.windows)
+            out[i] = drop_zero_weights(*averaging(before, log, np.maximum(window, 0)))
+    return out
+
+
+def _delay_s(observed: Observed, delays: Mapping[str, float]) -> Array:
+    """Delay (n,) of each sample of a channel, s."""
+    middle = 0.5 * (observed.begin_s + observed.end_s)
+    out = np.zeros(len(middle))
+    for key, value in delays.items():
+        if observed.channel in DELAYS[key]:
+            out += value * (middle / CLOCK_S if key == CLOCK_DRIFT else 1.0)
+    return out
 
 
 def driven_by(log: PreparedLog, vehicle: VehicleParams) -> PreparedLog:

@@ -7,12 +7,11 @@ several parameters that vanishes to first order is simulated along the direction
 typical sizes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -62,12 +61,12 @@ class SignatureBank:
     samples: tuple[int, ...]
 
     @classmethod
-    def empty(cls, evidence: GapEvidence) -> SignatureBank:
+    def empty(cls, evidence: GapEvidence) -> Self:
         """Without any law."""
         return cls({}, tuple(len(run.time_s) for run in evidence.runs))
 
     @classmethod
-    def of(cls, evidence: GapEvidence, simulate: bool = True) -> SignatureBank:
+    def of(cls, evidence: GapEvidence, simulate: bool = True) -> Self:
         """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones and
         delays by rollout, too, unless `simulate` is false."""
         signatures: dict[Hypothesis, dict[float, list[Array]]] = {}
@@ -91,7 +90,7 @@ class SignatureBank:
         bank = dataclasses.replace(cls.empty(evidence), signatures=signatures)
         return bank.with_sizes(evidence, simulated) if simulate else bank
 
-    def only(self, laws: Iterable[Hypothesis]) -> SignatureBank:
+    def only(self, laws: Iterable[Hypothesis]) -> Self:
         """With some laws alone."""
         kept = {law: self.signatures[law] for law in laws if law in self.signatures}
         return dataclasses.replace(self, signatures=kept)
@@ -113,7 +112,7 @@ class SignatureBank:
             for i, n in enumerate(self.samples)
         ]
 
-    def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> SignatureBank:
+    def with_sizes(self, evidence: GapEvidence, points: Sequence[SimulatedSize]) -> Self:
         """With further sizes of laws, the first of near ones, without those at which the twin diverges."""
         points = self._with_ends(points)
         runs = range(len(evidence.runs))

@@ -6,12 +6,10 @@ is, as a share of it, because the robot's law is another. They are fitted to set
 tests.studies.gap_sets`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
@@ -49,8 +47,8 @@ def calibration_head() -> Head:
     from terrafusion.datasets.core.config import structure
     from terrafusion.datasets.core.yaml_file import read_yaml
 
-    with resources.as_file(resources.files("terrafusion.twin.gap.infer") / "head.yaml") as path:
-        return structure(Head, read_yaml(path), file=path, key="")
+    path = Path(__file__).with_name("head.yaml")
+    return structure(Head, read_yaml(path), file=path, key="")
 
 
 def _weighted(found: Explanation, effects: int, temperature: float) -> tuple[list[Sets], Array]:

@@ -5,8 +5,6 @@ would depend on, and its signature in each channel by itself join the covariance
 the effect (after Kennedy and O'Hagan 2001, with a basis in place of a Gaussian process).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -108,8 +106,7 @@ class CloseLook:
         return found
 
     def _pairs(self) -> dict[tuple[int, int], float]:
-        """Log likelihood ratio of every pair of effects to first sight: one at its best alone, the other
-        beside it."""
+        """Log likelihood ratio of every pair of effects to first sight: one at its best, then the other."""
         names, out = self.laws.names, dict[tuple[int, int], float]()
         gains, _, used = self.laws.best(self.metric)
         for a in self.index:

@@ -6,8 +6,6 @@ promising ones of these, which a close look compares alone and in pairs. Where e
 more in a channel than the references do, the noise of that channel is taken to be larger.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -168,12 +166,7 @@ class _Explainer:
 
 
 def explain(
-    evidence: GapEvidence,
-    sigma: Array,
-    robot: RobotOffsets,
-    *,
-    close: bool,
-    without: Collection[str] = (),
+    evidence: GapEvidence, sigma: Array, robot: RobotOffsets, *, close: bool, without: Collection[str] = ()
 ) -> Explanation:
     """Log evidence of sets of effects.
 

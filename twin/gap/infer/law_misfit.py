@@ -11,8 +11,6 @@ Columns that act alike share what they explain (`RobotOffsets.modest`): large of
 cancel, are no law that could be wrong by as much.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -7,10 +7,9 @@ products in the inverse of the covariance of e - s, `Metric.K`: with w the coeff
 is made of, its log likelihood ratio is w'K e - w'K w / 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class Products:
     shared: int
 
     @classmethod
-    def of(cls, run: WhitenedRun, signatures: Array) -> Products:
+    def of(cls, run: WhitenedRun, signatures: Array) -> Self:
         """Of a run and its signatures (n, Q)."""
         return cls(run.gram_with(signatures), run.states, len(run.gram) - 1 - run.states)
 

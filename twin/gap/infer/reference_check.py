@@ -5,8 +5,6 @@ along. Where the judged runs meet it, because of another change, it explains a p
 changed itself.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of the judged runs against the twin with effects in it, by simulating it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The robot's own offsets in all columns are fitted beside the states: an offset t
 a run drives, as that of a wrong turning law, would else pass for a state that scatters.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

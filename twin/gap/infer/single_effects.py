@@ -6,13 +6,12 @@ of the prior that is as good (Laplace). A law is never quite the robot's: its si
 commands joins the covariance, in proportion to its size (after Kennedy and O'Hagan 2001).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +72,7 @@ class Laws:
     planes: Mapping[int, tuple[NDArray[np.int64], Array, Array]]
 
     @classmethod
-    def of(cls, candidates: Candidates, ladders: Mapping[Hypothesis, Ladder], shared: int, none: int) -> Laws:
+    def of(cls, candidates: Candidates, ladders: Mapping[Hypothesis, Ladder], shared: int, none: int) -> Self:
         """The candidates' laws; of those that have no ladder and are not linear there is no patch."""
         law, column, size = list[int](), list[tuple[int, int]](), list[tuple[float, float]]()
         planes = dict[int, tuple[NDArray[np.int64], Array, Array]]()
@@ -88,7 +87,7 @@ class Laws:
         columns, sizes = np.array(column, dtype=int).reshape(-1, 2), np.array(size).reshape(-1, 2)
         return cls(candidates, candidates.hypotheses, np.array(law, dtype=int), columns, sizes, planes)
 
-    def only(self, i: int) -> Laws:
+    def only(self, i: int) -> Self:
         """One law."""
         mine, planes = self.law == i, {k: v for k, v in self.planes.items() if k == i}
         return dataclasses.replace(

@@ -1,7 +1,5 @@
 """Noise of each channel, learnt from the reference runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,11 +16,7 @@ from terrafusion.twin.gap.rollout.residuals import (
     physical_error,
     whitened,
 )
-from terrafusion.twin.gap.rollout.shared_errors import (
-    ChannelNoise,
-    learn_gain,
-    without_shared,
-)
+from terrafusion.twin.gap.rollout.shared_errors import ChannelNoise, learn_gain, without_shared
 
 Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
@@ -115,8 +109,7 @@ def _fit_residuals(run: RunResiduals, noise: ChannelNoise, sigma: Array, size: f
 
 
 def _series(run: RunResiduals, noise: ChannelNoise, turn: float, rest: Sequence[Array]) -> dict[str, Series]:
-    """Residuals without the errors that channels share, in units of the data sheets' sigma, by channel and
-    window."""
+    """Residuals without shared errors, in sigmas of the data sheets, by channel and window."""
     own = without_shared(run.log, turn, [r[:, None] for r in rest])
     out = dict[str, Series]()
     for i, _, mine in sample_map(run.log).blocks:

@@ -6,8 +6,6 @@ the references spent at least a second in it, or as long as the judged runs. Cel
 turn rate that the references reach: half the speed is another drive for a slow robot, too.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

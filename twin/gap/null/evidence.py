@@ -1,7 +1,5 @@
 """Evidence of a diagnosis: whitened residuals of all runs against one twin, set to the references."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,10 +13,9 @@ from terrafusion.twin.gap.data.logs import digest, prepared
 from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
-from terrafusion.twin.gap.null.kept_fit import set_as_before
 from terrafusion.twin.gap.null.loud_noise import reference_loudness, with_loud_noise
 from terrafusion.twin.gap.null.patchiness import PATCHIER, patchier, with_patches
-from terrafusion.twin.gap.null.reference_twin import all_residuals, differences
+from terrafusion.twin.gap.null.reference_twin import all_residuals, differences, set_as_before
 from terrafusion.twin.gap.rollout.batch import is_thread_safe
 from terrafusion.twin.gap.rollout.outliers import limit_outliers
 from terrafusion.twin.gap.rollout.residuals import (

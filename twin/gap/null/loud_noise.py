@@ -5,8 +5,6 @@ slow drive to a fast one. Judged by the noise of the references, that would be a
 run is shows in the differences of successive white errors, which slow errors hardly change.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 

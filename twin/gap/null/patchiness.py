@@ -6,8 +6,6 @@ judged run on patchier ground is whitened with what it has above the references 
 scatter hold the rest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

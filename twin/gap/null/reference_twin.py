@@ -5,24 +5,29 @@ Effects are changes of a twin that drives as the references do: such numbers are
 Gauss-Newton steps (Marquardt 1963), from the best of a few starts.
 """
 
-from __future__ import annotations
-
+import contextlib
 import dataclasses
 import functools
 import itertools
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import quantities
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.predict import plant_of
 from terrafusion.twin.calibrate.start import coordinates_of
+from terrafusion.twin.engine.codegen import follows_from
+from terrafusion.twin.engine.library_cache import cache_folder
 from terrafusion.twin.engine.stability import stable_steps
 from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
@@ -131,8 +136,7 @@ class _Fit:
         return stable_steps(DT_S, plant_of(self.runs[0].log, model), INTEGRATOR_ORDER)
 
     def errors(self, points: Sequence[Array]) -> list[list[Array] | None]:
-        """Whitened errors (n,) of the runs at each of some points; None where the twin diverges or needs too
-        many steps."""
+        """Whitened errors (n,) of the runs at some points; None where the twin diverges or is too stiff."""
         models, count = [self.model(w) for w in points], len(self.runs)
         most = max(MOST_STEPS, self.steps(self.cache.model))
         soft = [self.steps(model) <= most for model in models]
@@ -251,6 +255,38 @@ def set_to_references(
             break
         logs, cache = [driven_by(log, model.vehicle) for log in logs], dataclasses.replace(cache, model=model)
     return model
+
+
+def set_as_before(
+    logs: Sequence[PreparedLog], cache: LinearisationCache, channels: Sequence[str], jobs: int
+) -> Model:
+    """As `set_to_references`, by the numbers, kept on disk, that an earlier diagnosis found for the same
+    references, twin and version of the library. Laws of the user's own may have changed since: with these,
+    nothing is kept."""
+    import joblib
+
+    c, names = cache.candidates, [one.name for one in numbers(cache, logs)]
+    version = follows_from("fit", c.keys)
+    if version is None:
+        return set_to_references(logs, cache, channels, jobs)
+    content = [logs[:RUNS], cache.model, c.scale, c.low, c.high, c.base, channels, version]
+    file = cache_folder() / f"references-{joblib.hash(content)}.json"
+    known = _kept_numbers(file)
+    if known is not None and [*known] == names:
+        return cache.model.replaced(known)
+    model = set_to_references(logs, cache, channels, jobs)
+    found = json.dumps({name: model.value(name) for name in names})
+    with contextlib.suppress(TerrafusionError, OSError):  # a full disk
+        write_atomically(file, lambda part: part.write_text(found, encoding="ascii"))
+    return model
+
+
+def _kept_numbers(file: Path) -> dict[str, float] | None:
+    """Numbers by name; None where there are none, or the file is damaged."""
+    try:
+        return {str(name): float(value) for name, value in json.loads(file.read_bytes()).items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
 
 
 def numbers(cache: LinearisationCache, logs: Sequence[PreparedLog]) -> list[Coordinate]:

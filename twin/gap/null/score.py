@@ -4,8 +4,6 @@ With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its informati
 C(alpha) tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

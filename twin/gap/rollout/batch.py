@@ -117,9 +117,7 @@ class Lane:
 
 
 def make_lanes(
-    runs: Sequence[tuple[PreparedLog, Model, Effects, Array]],
-    candidates: Candidates,
-    group: Sequence[str],
+    runs: Sequence[tuple[PreparedLog, Model, Effects, Array]], candidates: Candidates, group: Sequence[str]
 ) -> list[Lane]:
     """Lanes of (log, model, effects, poses (W, 3)); effects of the group, of the soil and those of the model
     that are no candidates are in the graph. Lanes with equal inputs share the array."""

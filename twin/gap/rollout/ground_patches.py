@@ -5,8 +5,6 @@ sensitivity of the whole run to the ground acts on wheels, body and motors as it
 the nearness; heading and position keep what they gained there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -7,8 +7,6 @@ gyro's noise is small. What the twin turns wrongly shows in the gyro alone, what
 the fixes. Nothing is lost: the map from gyro and fixes to these has an inverse.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -68,8 +66,7 @@ def _gyro(log: PreparedLog) -> int | None:
 
 
 def _integral(log: PreparedLog, gyro: int, at: int, rates: Array) -> Array:
-    """Integral (n, k) of rates (m, k) of the gyro's samples, from each window's start to the samples of a
-    channel."""
+    """Integral (n, k) of the gyro's rates (m, k) from each window's start to the samples of a channel."""
     rate, fix = log.observed[gyro], log.observed[at]
     of_rate, of_fix = window_index(log, gyro), window_index(log, at)
     out = np.zeros((len(fix.value), rates.shape[1]), dtype=rates.dtype)

@@ -337,8 +337,7 @@ def noise_sigma(observed: Observed, noise: ResidualNoise) -> Array:
 
 
 def whitened_columns(log: PreparedLog, noise: ChannelNoise, columns: Sequence[Array]) -> Array:
-    """Columns (n, k) of all channels, given one array a channel, in units and axes in which the noise is
-    white."""
+    """Columns (n, k) of all channels, given one array each, in units and axes of white noise."""
     columns = without_shared(log, noise.turn, columns)
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
     sigma = [noise_sigma(o, noise[o.channel]) for o in log.observed]

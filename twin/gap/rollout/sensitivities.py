@@ -18,6 +18,7 @@ from terrafusion.twin.gap.data.samples import (
     COARSE_STEP,
     coarse_counts,
     coarse_subset,
+    delayed_samples,
     sample_map,
     weighted_means,
 )
@@ -34,7 +35,6 @@ from terrafusion.twin.gap.rollout.batch import (
     motion_effects,
     simulate_lanes,
 )
-from terrafusion.twin.gap.rollout.delay import delayed_samples
 from terrafusion.twin.gap.rollout.ground_patches import patch_columns
 from terrafusion.twin.gap.rollout.measured_turns import as_measured, turned_apart, with_heading_errors
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS

@@ -7,8 +7,6 @@ has an inverse, so that errors and sensitivities keep all they say; where wheels
 the gain is zero. Fixes share the gyro's errors by `measured_turns`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 from terrafusion.datasets.core.arrays import Array

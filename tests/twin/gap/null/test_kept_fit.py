@@ -11,8 +11,8 @@ from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
-from terrafusion.twin.gap.null import kept_fit
-from terrafusion.twin.gap.null.kept_fit import set_as_before
+from terrafusion.twin.gap.null import reference_twin
+from terrafusion.twin.gap.null.reference_twin import set_as_before
 from terrafusion.twin.gap.rollout.residuals import LinearisationCache
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.twin.gap.runs import runs
@@ -32,8 +32,8 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
         out.append(0.1 * (1 + len(out)) / 3.0)
         return cache.model.replaced({NUMBER: out[-1]})
 
-    monkeypatch.setattr(kept_fit, "set_to_references", fit)
-    monkeypatch.setattr(kept_fit, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(reference_twin, "set_to_references", fit)
+    monkeypatch.setattr(reference_twin, "cache_folder", lambda: tmp_path)
     return out
 
 

@@ -12,8 +12,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.effects.sensing import IMU
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.logs import prepared
-from terrafusion.twin.gap.data.samples import sample_map
-from terrafusion.twin.gap.rollout.delay import delayed_samples
+from terrafusion.twin.gap.data.samples import delayed_samples, sample_map
 from terrafusion.twin.gap.rollout.sensitivities import (
     Rollout,
     channel_sensitivities,
