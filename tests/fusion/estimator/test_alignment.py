@@ -283,3 +283,14 @@ def test_a_robot_that_drives_on_without_fixes_starts_where_the_few_there_were_pl
         off_m = state.position_m[:2] - [30.0, 7.0]
         assert abs(np.hypot(*off_m) - 6.0) < 3.0
         assert off_m @ np.linalg.solve(state.covariance[:2, :2], off_m) < 9.21
+
+
+def test_an_imu_that_falls_silent_stalls_the_estimator() -> None:
+    estimator = Estimator(
+        EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=SensorConfig(gnss=False))
+    )
+    for t_ns in range(0, 6_000_000_000, 20_000_000):
+        estimator.add_wheels(t_ns, 0.5, 0.5)
+        if t_ns < 3_000_000_000:
+            estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
+        assert (estimator.status == "stalled") == (t_ns > 4_980_000_000)
