@@ -83,6 +83,20 @@ def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
     assert run_checks(dataclasses.replace(stuck, terrain_name="snow")) == []
 
 
+def test_a_straight_run_in_reverse_is_no_error() -> None:
+    """Nothing but the wheels says which way the robot drove."""
+    good = body_speed(without(lively_drive(), "truth", "command"))
+    assert good.wheels is not None
+    assert good.imu is not None
+    even = np.full_like(good.wheels.speed, -1.0)
+    imu = Imu(good.imu.t_ns, good.imu.gyro_radps * 0.0, good.imu.accel_mps2 * [0.01, 0.01, 1.0])
+    reverse = dataclasses.replace(
+        good, imu=imu, gnss=None, wheels=dataclasses.replace(good.wheels, speed=even)
+    )
+    found = [(f.code, f.severity, f.repair) for f in run_checks(reverse) if f.code == "wheel-reversed"]
+    assert found == [("wheel-reversed", "warning", None)]
+
+
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
     """The yaw rate of the drive as commanded."""
     assert r.command is not None
