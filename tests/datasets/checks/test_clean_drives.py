@@ -97,6 +97,24 @@ def test_a_straight_run_in_reverse_is_no_error() -> None:
     assert found == [("wheel-reversed", "warning", None)]
 
 
+@pytest.mark.parametrize("stands_s", [0.0, 10.0])
+def test_a_robot_that_circles_fast_is_clean(stands_s: float) -> None:
+    """Its mean specific force is gravity and the force of the turn: 5 m/s times 1.5 rad/s."""
+    good = body_speed(without(lively_drive(), "gnss", "truth", "command"))
+    assert good.wheels is not None
+    assert good.imu is not None
+    t, moving = ((one.t_ns - START_NS) * 1e-9 for one in (good.imu, good.wheels))
+    gyro, accel, noise = np.zeros((len(t), 3)), np.zeros((len(t), 3)), np.random.default_rng(0)
+    gyro[:, 2] = np.where(t < stands_s, 0.0, 1.5)
+    accel[:, 1], accel[:, 2] = 5.0 * gyro[:, 2], 9.81
+    imu = Imu(good.imu.t_ns, *(x + noise.normal(0.0, 0.01, x.shape) for x in (gyro, accel)))
+    speed = np.where(moving < stands_s, 0.0, 5.0 / RADIUS_M)[:, None] + noise.normal(
+        0.0, 1e-3, good.wheels.speed.shape
+    )
+    circling = dataclasses.replace(good, imu=imu, wheels=dataclasses.replace(good.wheels, speed=speed))
+    assert [f.code for f in run_checks(circling) if f.severity == "error"] == []
+
+
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
     """The yaw rate of the drive as commanded."""
     assert r.command is not None
