@@ -115,6 +115,24 @@ def test_a_robot_that_circles_fast_is_clean(stands_s: float) -> None:
     assert [f.code for f in run_checks(circling) if f.severity == "error"] == []
 
 
+@pytest.mark.parametrize(("down", "height_m"), [(-1.0, 3.0), (1.0, 3.0), (-1.0, 0.0)])
+def test_upward_velocities_of_a_receiver_that_counts_down(down: float, height_m: float) -> None:
+    good = lively_drive()
+    assert good.gnss is not None
+    assert good.gnss.velocity_enu_mps is not None
+    t = (good.gnss.t_ns - START_NS) * 1e-9
+    enu, velocity = good.gnss.enu_m.copy(), good.gnss.velocity_enu_mps.copy()
+    enu[:, 2] = height_m * np.sin(0.1 * t) + np.random.default_rng(0).normal(0.0, 0.03, len(t))
+    velocity[:, 2] = down * 0.1 * height_m * np.cos(0.1 * t)
+    gnss = dataclasses.replace(good.gnss, enu_m=enu, velocity_enu_mps=velocity)
+    hilly = dataclasses.replace(good, gnss=gnss)
+    wrong = [f for f in run_checks(hilly) if f.code == "gnss-velocity"]
+    assert ["downwards" in f.what for f in wrong] == ([True] if down < 0.0 < height_m else [])
+    for finding in wrong:
+        assert finding.repair is not None
+        assert "gnss-velocity" not in {f.code for f in run_checks(finding.repair(hilly))}
+
+
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
     """The yaw rate of the drive as commanded."""
     assert r.command is not None
