@@ -8,7 +8,14 @@ from functools import partial
 import numpy as np
 
 from terrafusion.datasets.checks import motion
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed, with_fields
+from terrafusion.datasets.checks.finding import (
+    CheckContext,
+    Finding,
+    Repair,
+    changed,
+    changed_field,
+    with_fields,
+)
 from terrafusion.datasets.checks.path import fit_windows, path_by
 from terrafusion.datasets.checks.truth import UNITS
 from terrafusion.datasets.core.channels import Gnss
@@ -171,6 +178,30 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
         f"{fit.mirrored_r:.2f} if mirrored"
     )
     yield Finding("gnss-velocity", "warning", "gnss", f"velocities {what}", evidence, fix, repair)
+
+
+def check_upward_velocity(context: CheckContext) -> Iterator[Finding]:
+    """Upward velocities must be the rate of the heights; with z down, as in NED, they have the other sign."""
+    gnss = context.recording.gnss
+    if gnss is None or gnss.velocity_enu_mps is None:
+        return
+    first = np.array([1.0, 0.0, 0.0])
+    upwards = dataclasses.replace(
+        gnss,
+        enu_m=gnss.enu_m[:, [2]] * first,
+        velocity_enu_mps=gnss.velocity_enu_mps[:, [2]] * first,
+        sigma_enu_m=gnss.sigma_enu_m[:, [2, 2, 2]],
+    )
+    fit = velocity_fit(upwards)
+    if fit is None or fit.r < SURE_R or not -1.5 < fit.factor.real < -0.5:
+        return
+    yield Finding(
+        "gnss-velocity", "warning", "gnss",
+        "velocities count downwards, as in NED",
+        f"against differenced heights: factor {fit.factor.real:.2f}, correlation {fit.r:.2f}",
+        "change the sign of the upward velocity",
+        changed_field("gnss", "velocity_enu_mps", lambda velocity: velocity * (1.0, 1.0, -1.0)),
+    )  # fmt: skip
 
 
 def _position_unit(fit: VelocityFit) -> str | None:

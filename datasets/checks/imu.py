@@ -44,6 +44,8 @@ robot is not at rest."""
 IMPOSSIBLE_BIAS_RADPS = 0.1
 """5.7 deg/s; no gyro of a robot is so far off: the axis is broken, or its value is not a rate."""
 LEAST_REST_ROWS = 50
+CIRCLING_MPS2 = 3.0
+"""Mean speed times rate of turn, about any axis, above which the mean force is not gravity (assumed)."""
 MOST_TILT = np.cos(np.radians(30.0))
 """Slopes of up to 25 deg tilt the mean specific force by as much."""
 WINDOW_S, SMOOTH_S = 0.5, 8.0
@@ -72,7 +74,22 @@ def gravity(context: CheckContext) -> Array | None:
     imu = context.recording.imu
     if imu is None or not imu.has_accel() or len(imu) < 10:
         return None
-    return np.asarray(_mounting(context) @ np.nanmean(imu.accel_mps2, axis=0))
+    rows = _not_circling(context, imu)
+    if rows.sum() < LEAST_REST_ROWS <= len(imu):
+        return None
+    return np.asarray(_mounting(context) @ np.nanmean(imu.accel_mps2[rows], axis=0))
+
+
+def _not_circling(context: CheckContext, imu: Imu) -> Mask:
+    """Mask (N,) of samples without the force of a turn, where that would be taken for gravity; else all."""
+    driven, every = motion.wheel_speed(context), np.ones(len(imu), dtype=bool)
+    if driven is None:
+        return every
+    speed = np.interp(motion.seconds(imu.t_ns, context.recording.start_ns), *driven)
+    turning = np.nan_to_num(speed[:, None] * imu.gyro_radps)
+    if np.linalg.norm(turning.mean(axis=0)) <= CIRCLING_MPS2:
+        return every
+    return np.asarray(np.linalg.norm(turning, axis=1) < CIRCLING_MPS2)
 
 
 def _mounting(context: CheckContext) -> Array:

@@ -63,6 +63,7 @@ CHECKS: tuple[Check, ...] = (
     gnss.check_scatter,
     gnss.check_dilution,
     gnss_frame.check_velocity,
+    gnss_frame.check_upward_velocity,
     truth.check_unit,
     truth.check_yaw,
     truth.check_frame,
@@ -77,7 +78,7 @@ LARGEST = 1e6
 """Numbers up to this may be in small units (mm/s, deg/s); larger ones are not computed with."""
 
 MAX_ROUNDS = 20
-SEVERAL = ("wheel-odd", "clock-jump")
+SEVERAL = ("wheel-odd", "clock-jump", "gnss-velocity")
 """Codes of which one channel can have several findings, identified by their description."""
 
 

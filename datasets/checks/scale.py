@@ -63,7 +63,8 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
     if scale.source == "truth":
         evidence += f"; {NOT_INDEPENDENT}"
     known = 1.0 + context.known("wheel_scale")
-    units = _fitting_units(context, scale, float(np.std(fits.scale) / np.median(fits.scale)))
+    spread = float(np.sqrt(np.average((fits.scale / scale.ratio - 1.0) ** 2, weights=fits.weight)))
+    units = _fitting_units(context, scale, spread)
     if units:
         factor, names = next(iter(units.values())), " or ".join(units)
         yield Finding(

@@ -33,6 +33,7 @@ WIDEST_TRACK_M = 6.0
 """Sides at speeds -v and v spin a robot at v over half its effective track, which is below this."""
 LEAST_S, LEAST_MPS = 10.0, 0.05
 """Shorter and slower runs do not show the direction of the wheels."""
+MOSTLY_BACKWARDS = "they run backwards nearly all the time"
 LEAST_PROGRESS = 0.3
 """Distance covered over distance rolled, if the sides turn the same way, above which it does not spin."""
 
@@ -110,8 +111,16 @@ def check_wheel_signs(context: CheckContext) -> Iterator[Finding]:
 
 def check_direction(context: CheckContext) -> Iterator[Finding]:
     """The wheels must run forwards when the robot does."""
-    evidence = runs_backwards(context)
-    if evidence is None or sides_opposed(context) is not None:
+    evidence, wheels = runs_backwards(context), context.recording.wheels
+    if evidence is None or wheels is None or sides_opposed(context) is not None:
+        return
+    if evidence == MOSTLY_BACKWARDS and not (wheels.has_sides() and turning_axis(context)):
+        yield Finding(
+            "wheel-reversed", "warning", "wheels",
+            evidence,
+            "nothing else shows which way the robot drove",
+            "if it did not reverse, change the sign of all wheels",
+        )  # fmt: skip
         return
     yield Finding(
         "wheel-reversed", "error", "wheels",
@@ -232,7 +241,7 @@ def runs_backwards(context: CheckContext) -> str | None:
             return f"{name} goes the other way (correlation {r:.2f})" if r < -motion.SURE_R else None
     total = float(np.abs(v).sum())
     mostly = total > 0.0 and float(v.sum()) / total < -MOSTLY and t[-1] - t[0] > LEAST_S
-    return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(context) else None
+    return MOSTLY_BACKWARDS if mostly and wheels_turn_backwards(context) else None
 
 
 def _forward_distances(context: CheckContext) -> dict[str, motion.Integral]:

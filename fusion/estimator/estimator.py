@@ -259,9 +259,9 @@ class Estimator:
 
     @property
     def status(self) -> str:
-        """A key of `STATUS`, also before the first state."""
+        """A key of `STATUS`, also before the first state, and where samples no longer make states."""
         if self._state is not None:
-            return self._state.status
+            return "stalled" if self.imu.stalled else self._state.status
         return "waiting" if self._search.level is None else "aligning"
 
     def finish(self) -> None:

@@ -1,11 +1,13 @@
 """Notes on how an estimator used its inputs, in sentences."""
 
 from terrafusion.datasets.core.printable import counted, times
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.inputs.time_jumps import JUMP_NS
 from terrafusion.fusion.inputs.validation import MOST_MPS, MOST_MPS2, MOST_RADPS
+from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
@@ -13,9 +15,27 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     notes = _on_fixes(estimator.gnss)
     if found := estimator.weights.found_grounds():
         notes.append("grounds found while driving, with their slip: " + ", ".join(found))
+    learner = estimator.weights.grounds
+    if learner is not None and (memory := learner.memory).left_out:
+        notes.append(
+            f"the ground memory is full: {0.5 * memory.left_out:.0f} s on ground other than its "
+            f"{len(memory)} were not learned"
+        )
+    notes += _on_policy(estimator.config)
     if level := estimator.learned.mounting.level.note():
         notes.append(level)
     return (*notes, *_on_samples(estimator), *_on_times(estimator), *estimator.aids.notes())
+
+
+def _on_policy(config: EstimatorConfig) -> list[str]:
+    """A policy whose grounds the detector cannot tell."""
+    model = (config.terrain_model or load_terrain_model()).for_vehicle(config.vehicle)
+    if config.mode != "adaptive" or not model.classes or set(model.classes) & set(config.policy.classes):
+        return []
+    return [
+        f"'{config.policy.name}' has none of the grounds that the terrain model knows "
+        f"({', '.join(model.classes)}): the noise of `{UNKNOWN}` counts on all"
+    ]
 
 
 def _on_fixes(gnss: GnssUpdater) -> list[str]:

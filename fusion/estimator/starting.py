@@ -25,8 +25,9 @@ CLEAR_YAW_RAD, CLEARER_NS = 0.3, 10_000_000_000
 for, a start waits for so long: until the robot stops turning (assumed)."""
 MANY_FIXES = 10
 """From so many fixes on the position is known, and any heading will do, with the sigma that it has
-(assumed). Such a path, and one whose heading an antenna or a delay leaves open, is local, as it is without
-fixes, until they lay it onto the map: the graph would make too much of the few fixes there are."""
+(assumed); with fewer, the next one is waited for as the first is. Such a path, and one whose heading an
+antenna or a delay leaves open, is local, as it is without fixes, until they lay it onto the map: the graph
+would make too much of the few fixes there are."""
 
 
 class StartSearch:
@@ -74,12 +75,15 @@ class StartSearch:
         if self._gnss.have_new():
             self._newest_fix_came_ns = now_ns
             return self._by_motion(imu, wheels, steering, self.level)
-        if last or now_ns - self._newest_fix_came_ns > SILENT_NS:
-            start = self._by_rough_heading(wheels, self.level)
-            if start is None:
-                self._drop_unusable(imu, wheels)
-            return start
-        return None
+        silent_ns = now_ns - self._newest_fix_came_ns
+        if not last and silent_ns <= SILENT_NS:
+            return None
+        start = self._by_rough_heading(wheels, self.level)
+        if start is None and not last and silent_ns * 1e-9 > self._config.longest_wait_s:
+            return self._without_heading(self.level)
+        if start is None:
+            self._drop_unusable(imu, wheels)
+        return start
 
     def _by_motion(
         self, imu: ImuStream, wheels: WheelStream, steering: SteeringStream, level: Start
@@ -110,7 +114,14 @@ class StartSearch:
             return rough.start
         if not tells_forward and len(fixes) < MANY_FIXES:
             return None
-        start = rough.alone()
+        return self._without_heading(level)
+
+    def _without_heading(self, level: Start) -> Start:
+        """A local start, at the place that the fixes gave where they gave one."""
+        if self._rough is None:
+            self._gnss.local = True
+            return level
+        start = self._rough.alone()
         self._gnss.place(start)
         self.known = dataclasses.replace(start, yaw_sigma_rad=level.yaw_sigma_rad)
         return self.known.at(level)

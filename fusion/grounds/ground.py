@@ -122,6 +122,13 @@ class Ground:
         mean = self.friction + weight / n * (friction - self.friction)
         return dataclasses.replace(self, friction=mean, friction_windows=n)
 
+    def same_as(self, other: "Ground") -> bool:
+        """Whether both hold the same numbers, by whatever name."""
+        mine, others = (
+            [*vars(g.signature).values(), *vars(g.motion).values(), g.friction] for g in (self, other)
+        )
+        return all(map(np.array_equal, mine, others))
+
     def merged(self, other: "Ground") -> "Ground":
         """This ground with what `other` knows of the same one."""
         windows = self.friction_windows + other.friction_windows

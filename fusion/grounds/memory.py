@@ -43,6 +43,7 @@ class GroundMemory:
     Attributes:
         grounds: in the order in which they were met.
         robot: name or type of the robot, "" where not known.
+        left_out: windows on new ground for which there was no place.
     """
 
     def __init__(self, grounds: Sequence[Ground] = (), robot: str = "") -> None:
@@ -51,6 +52,7 @@ class GroundMemory:
         self._belief: list[float] = self._prior().tolist()
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
+        self.left_out = 0
 
     def __repr__(self) -> str:
         """A line a ground."""
@@ -134,6 +136,7 @@ class GroundMemory:
                 self._found(date)
             return
         self._waiting.clear()
+        self.left_out += best == 0
         if best:
             weight = float(self.belief[best])
             ground = self.grounds[best - 1].seen(signature, weight, date)
@@ -177,11 +180,17 @@ class GroundMemory:
 
 
 def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
-    """The grounds of several robots of one type as one memory; those that look alike become one."""
+    """The grounds of several robots of one type as one memory; those that look alike become one.
+
+    What is there twice, as in a memory given twice, counts once.
+    """
     found = list(memories)
-    grounds, names = [], set[str]()
+    grounds: list[Ground] = []
+    names = set[str]()
     for memory in found:
         for ground in memory.grounds:
+            if any(ground.same_as(other) for other in grounds):
+                continue
             name, i = ground.name, 1
             while name in names and name.startswith("ground "):
                 name, i = f"ground {i}", i + 1

@@ -1,16 +1,39 @@
 """Samples of a sensor in the order of their times; they may come late, out of order, or far ahead."""
 
 import bisect
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.inputs.time_jumps import CONFIRMED, JUMP_NS, Newest, TimeJump
+from terrafusion.fusion.inputs.time_jumps import (
+    CONFIRMED,
+    CONFIRMED_NS,
+    JUMP_NS,
+    ClockJumpError,
+    Newest,
+    TimeJump,
+)
 
 MOST_LATE_S = 5.0
 """A sample this much older than its stream's newest is no late message: the clock has jumped."""
 LONGEST_WAIT_S = 0.5
+SILENT_NS = 2_000_000_000
+"""A stream that another one is so far ahead of is silent (assumed)."""
 BLOCK = 256
 """Old samples are dropped so many at a time, so that it stays cheap."""
+
+
+@dataclass
+class SetBack:
+    """Samples in order that are older than their stream's newest: times of the first and the last, how late
+    the first was, time of the newest sample of all streams then, and their number.
+    """
+
+    first_ns: int
+    last_ns: int
+    late_ns: int
+    others_ns: int
+    count: int = 1
 
 
 class Lateness:
@@ -24,6 +47,7 @@ class Lateness:
         used_ns: end of what the keyframes have used.
         too_late: number of samples left out because their keyframe had been made.
         jump: samples that come far ahead.
+        back: late ones in a row.
     """
 
     def __init__(self, channel: str, newest: Newest | None = None) -> None:
@@ -32,6 +56,7 @@ class Lateness:
         self.wait_ns = 0
         self.used_ns: int | None = None
         self.too_late = 0
+        self.back: SetBack | None = None
 
     def from_future(self, t_ns: int, times: list[int]) -> int:
         """How many of the newest samples, too few for a jump, have wrong times; before the start only."""
@@ -48,11 +73,21 @@ class Lateness:
         """Index in `times` where a sample belongs, or None when it is too late.
 
         Raises:
-            DataError: the sample is so old that the clock must have jumped.
+            DataError: the sample is so old that its clock must be another.
+            ClockJumpError: all are for half a second, and no other stream has gone on.
         """
         if not times or t_ns >= times[-1]:
+            self.back = None
+            if self.used_ns is not None and self.used_ns - t_ns > JUMP_NS:
+                raise DataError(
+                    f"sample at {t_ns} ns comes {(self.used_ns - t_ns) * 1e-9:.3f} s after its time has been "
+                    "estimated",
+                    channel=self.channel,
+                    remedy="set its clock to that of the IMU, or send it earlier; it is left out",
+                )
             return len(times)
         late_ns = times[-1] - t_ns
+        self._watch_clock(t_ns, late_ns)
         if late_ns > MOST_LATE_S * 1e9:
             raise DataError(
                 f"sample at {t_ns} ns comes {late_ns * 1e-9:.3f} s after a newer one",
@@ -65,6 +100,24 @@ class Lateness:
             self.too_late += 1
             return None
         return bisect.bisect_right(times, t_ns)
+
+    def _watch_clock(self, t_ns: int, late_ns: int) -> None:
+        """Raise where samples go on in order, far behind the newest: no messages are late like that."""
+        newest_ns, run = self.jump.newest.t_ns or t_ns, self.back
+        if run is None or t_ns < run.last_ns:
+            self.back = SetBack(t_ns, t_ns, late_ns, newest_ns)
+            return
+        run.last_ns, run.count = t_ns, run.count + 1
+        if run.late_ns <= JUMP_NS or run.count < CONFIRMED or t_ns - run.first_ns < CONFIRMED_NS:
+            return
+        what = f"sample at {t_ns} ns: its clock was set back by {run.late_ns * 1e-9:.1f} s"
+        if newest_ns - run.others_ns > CONFIRMED_NS // 2:
+            raise DataError(
+                f"{what}, those of the other sensors were not",
+                channel=self.channel,
+                remedy="set its clock right; until then its samples are left out",
+            )
+        raise ClockJumpError(what, channel=self.channel, remedy="start anew where a clock jumps")
 
 
 class SampleStream:
@@ -97,6 +150,12 @@ class SampleStream:
             for column in self._columns():
                 del column[-wrong:]
         return self.late.place(t_ns, self.t_ns)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether its samples do not come, or are not used, while those of another stream do."""
+        jump = self.late.jump
+        return jump.refuted_ns is not None or (jump.newest.t_ns or 0) - self.t_ns[-1] > SILENT_NS
 
     def covers(self, t_ns: int) -> bool:
         """Whether a keyframe at `t_ns` need not wait for samples."""

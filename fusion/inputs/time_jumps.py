@@ -29,7 +29,7 @@ LONGEST_REFUTED_NS = 5_000_000_000
 
 
 class ClockJumpError(DataError):
-    """IMU or wheels have been ahead of all others for so long that they will not return."""
+    """The clock of IMU and wheels was set, ahead of the fixes or back: an estimator must start anew."""
 
 
 def median_step_ns(times: Iterable[int]) -> int:
@@ -109,7 +109,8 @@ class TimeJump:
         held: samples ahead, each beginning with its time.
         used_count, fix_count: samples used and fixes that had come when the first of `held` came.
         dropped: number of samples whose time no other confirmed, or another stream contradicted.
-        refuted_ns: time of the first sample in a row that fixes contradict.
+        refuted_ns: time of the first sample in a row that fixes or another stream contradict.
+        others: number of samples used until then.
     """
 
     newest: Newest
@@ -119,12 +120,14 @@ class TimeJump:
     fix_count: int = 0
     dropped: int = 0
     refuted_ns: int | None = None
+    others: int = 0
 
     def admitted(self, sample: tuple[Any, ...]) -> list[tuple[Any, ...]]:
         """The samples to use now: this one, none while it is far ahead, or all held once they agree.
 
         Raises:
             ClockJumpError: for seconds they have been ahead of fixes that go on as before.
+            DataError: for seconds they have been ahead of another stream that does.
         """
         t_ns, before, newest = sample[0], [], self.newest
         if not self.held and newest.t_ns is not None and t_ns - newest.t_ns <= JUMP_NS:  # as most are
@@ -134,11 +137,11 @@ class TimeJump:
         if self.held and not self.newest.is_jump(self.held[-1][0]):  # another stream has confirmed them
             before = self.held[:]
             self.held.clear()
-        refuted = self._fixes_go_on()
+        another = bool(self.held) and self.newest.used_count != self.used_count
+        refuted = self._fixes_go_on() or another
         if self.held and not (
             self.newest.is_jump(t_ns)
             and abs(t_ns - self.held[-1][0]) <= self.newest.jump_ns()
-            and self.newest.used_count == self.used_count  # else another stream goes on as before
             and not refuted
         ):
             self.dropped += len(self.held)
@@ -173,14 +176,22 @@ class TimeJump:
         return newest.t_ns < newest.fixes_ns[-1] < self.held[0][0] - JUMP_NS
 
     def _refuse_for_long(self, t_ns: int, refuted: bool) -> None:
-        """Raise where fixes have contradicted all samples for long."""
-        if not self.newest.is_jump(t_ns):
+        """Raise where fixes or another stream have contradicted all samples for long."""
+        newest = self.newest
+        if not newest.is_jump(t_ns):
             self.refuted_ns = None
-        elif refuted and self.refuted_ns is None:
-            self.refuted_ns = t_ns
-        elif self.refuted_ns is not None and t_ns - self.refuted_ns > LONGEST_REFUTED_NS:
+        elif self.refuted_ns is None:
+            self.refuted_ns, self.others = (t_ns if refuted else None), newest.used_count
+        elif t_ns - self.refuted_ns > LONGEST_REFUTED_NS:
             self.dropped += 1
-            ahead_s = (t_ns - self.newest.fixes_ns[-1]) * 1e-9
+            if newest.used_count - self.others > CONFIRMED or not newest.fixes_ns:
+                ahead_s = (t_ns - (newest.t_ns or t_ns)) * 1e-9
+                raise DataError(
+                    f"sample at {t_ns} ns is {ahead_s:.1f} s ahead of other sensors, which go on as before",
+                    channel=self.channel,
+                    remedy="set its clock right; until then its samples are left out",
+                )
+            ahead_s = (t_ns - newest.fixes_ns[-1]) * 1e-9
             raise ClockJumpError(
                 f"sample at {t_ns} ns is {ahead_s:.1f} s ahead of the fixes, which go on as before",
                 channel=self.channel,

@@ -294,16 +294,17 @@ class LiveNode:
             if kind := arriving.join(message.topic, message.msgtype):
                 self._say(f"{kind}: {message.topic} ({message.msgtype})")
         try:
-            samples = arriving.samples(message)
+            for t_ns, kind, sample in arriving.samples(message):
+                self._order(t_ns, kind, sample, message.receipt_ns)
+        except ClockJumpError as error:
+            self.reset(error.what)
         except (TerrafusionError, BagError) as error:
             self._refuse(message.topic, error)
-            return
-        for t_ns, kind, sample in samples:
-            self._order(t_ns, kind, sample, message.receipt_ns)
 
     def _order(self, t_ns: int, kind: str, sample: Any, receipt_ns: int) -> None:
         newest_ns = self._jump.newest.t_ns
         if kind == "gnss":
+            self._jump.newest.fix(t_ns)
             for one in self._early_fixes.in_order(t_ns, sample):
                 self._ordered.add(one[0], kind, one[1])
             return

@@ -115,16 +115,23 @@ class TerrainNoise:
         return None if self.grounds is None else self.grounds.memory.condensed()
 
     def found_grounds(self) -> list[str]:
-        """Name and slip of the grounds whose own slip the estimate expects, where there are several."""
+        """Names and slip of the grounds whose own slip the estimate expects, where there are several that
+        differ by more than their sigmas; the others are named together.
+        """
         if self.grounds is None or not (self.adaptive and self._starts_pooled):
             return []
+        slips, alike = self._ground_slip.known(), list[list[int]]()
+        for i in sorted(slips, key=lambda i: slips[i][0]):
+            (first, sigma), (mean, own) = slips[alike[-1][0]] if alike else (-math.inf, 0.0), slips[i]
+            if mean - first > math.hypot(sigma, own):
+                alike.append([])
+            alike[-1].append(i)
         names = [ground.name for ground in self.grounds.memory.grounds]
-        slips = [
-            (name, slip)
-            for name, slip in zip(names, self._ground_slip.known(), strict=False)
-            if slip is not None
+        lines = [
+            f"{' and '.join(names[i] for i in sorted(some))} {np.mean([slips[i][0] for i in some]):.2f}"
+            for some in alike
         ]
-        return [f"{name} {slip:.2f}" for name, slip in slips] if len(slips) > 1 else []
+        return lines if len(lines) > 1 else []
 
     def found_shares(self) -> dict[str, float]:
         """Share of each found ground in the time on ground that no class describes; the rest was new."""

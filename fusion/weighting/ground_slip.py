@@ -81,10 +81,11 @@ class GroundSlip:
             self._known = {i: ground for i, ground in self._known.items() if i not in stale}
             self.expect(*self._whole)
 
-    def known(self) -> list[float | None]:
-        """Slip of each ground in the order of the memory; None where the drive has not shown it clearly."""
-        means, shares = self._slip.posterior()[0].tolist(), self._slip.shares().tolist()
-        return [mean if share > CLEAR else None for mean, share in zip(means[1:], shares[1:], strict=True)]
+    def known(self) -> dict[int, tuple[float, float]]:
+        """Slip and its 1 sigma of the grounds that the drive has shown clearly, by place in the memory."""
+        means, sigmas = self._slip.posterior()
+        clear = np.flatnonzero(self._slip.shares()[1:] > CLEAR).tolist()
+        return {i: (float(means[1 + i]), float(sigmas[1 + i])) for i in clear}
 
     def take_switch(self) -> float:
         """Share of the slip to renew: 0 where it follows the mean that is now expected, 1 where that mean

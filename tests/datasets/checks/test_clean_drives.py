@@ -83,6 +83,56 @@ def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
     assert run_checks(dataclasses.replace(stuck, terrain_name="snow")) == []
 
 
+def test_a_straight_run_in_reverse_is_no_error() -> None:
+    """Nothing but the wheels says which way the robot drove."""
+    good = body_speed(without(lively_drive(), "truth", "command"))
+    assert good.wheels is not None
+    assert good.imu is not None
+    even = np.full_like(good.wheels.speed, -1.0)
+    imu = Imu(good.imu.t_ns, good.imu.gyro_radps * 0.0, good.imu.accel_mps2 * [0.01, 0.01, 1.0])
+    reverse = dataclasses.replace(
+        good, imu=imu, gnss=None, wheels=dataclasses.replace(good.wheels, speed=even)
+    )
+    found = [(f.code, f.severity, f.repair) for f in run_checks(reverse) if f.code == "wheel-reversed"]
+    assert found == [("wheel-reversed", "warning", None)]
+
+
+@pytest.mark.parametrize("stands_s", [0.0, 10.0])
+def test_a_robot_that_circles_fast_is_clean(stands_s: float) -> None:
+    """Its mean specific force is gravity and the force of the turn: 5 m/s times 1.5 rad/s."""
+    good = body_speed(without(lively_drive(), "gnss", "truth", "command"))
+    assert good.wheels is not None
+    assert good.imu is not None
+    t, moving = ((one.t_ns - START_NS) * 1e-9 for one in (good.imu, good.wheels))
+    gyro, accel, noise = np.zeros((len(t), 3)), np.zeros((len(t), 3)), np.random.default_rng(0)
+    gyro[:, 2] = np.where(t < stands_s, 0.0, 1.5)
+    accel[:, 1], accel[:, 2] = 5.0 * gyro[:, 2], 9.81
+    imu = Imu(good.imu.t_ns, *(x + noise.normal(0.0, 0.01, x.shape) for x in (gyro, accel)))
+    speed = np.where(moving < stands_s, 0.0, 5.0 / RADIUS_M)[:, None] + noise.normal(
+        0.0, 1e-3, good.wheels.speed.shape
+    )
+    circling = dataclasses.replace(good, imu=imu, wheels=dataclasses.replace(good.wheels, speed=speed))
+    assert [f.code for f in run_checks(circling) if f.severity == "error"] == []
+
+
+@pytest.mark.parametrize(("down", "height_m"), [(-1.0, 3.0), (1.0, 3.0), (-1.0, 0.0)])
+def test_upward_velocities_of_a_receiver_that_counts_down(down: float, height_m: float) -> None:
+    good = lively_drive()
+    assert good.gnss is not None
+    assert good.gnss.velocity_enu_mps is not None
+    t = (good.gnss.t_ns - START_NS) * 1e-9
+    enu, velocity = good.gnss.enu_m.copy(), good.gnss.velocity_enu_mps.copy()
+    enu[:, 2] = height_m * np.sin(0.1 * t) + np.random.default_rng(0).normal(0.0, 0.03, len(t))
+    velocity[:, 2] = down * 0.1 * height_m * np.cos(0.1 * t)
+    gnss = dataclasses.replace(good.gnss, enu_m=enu, velocity_enu_mps=velocity)
+    hilly = dataclasses.replace(good, gnss=gnss)
+    wrong = [f for f in run_checks(hilly) if f.code == "gnss-velocity"]
+    assert ["downwards" in f.what for f in wrong] == ([True] if down < 0.0 < height_m else [])
+    for finding in wrong:
+        assert finding.repair is not None
+        assert "gnss-velocity" not in {f.code for f in run_checks(finding.repair(hilly))}
+
+
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
     """The yaw rate of the drive as commanded."""
     assert r.command is not None

@@ -34,9 +34,11 @@ def judged(
     spread: float = 0.5,
     source: str = "gnss",
     wheel_scale: float = 0.0,
+    weight: np.ndarray | None = None,
 ) -> list[Finding]:
     """Findings where the ground speed is `ratio` times the wheels', to within `half`."""
-    fits = SimpleNamespace(scale=ratio * np.array([1.0 - spread, 1.0, 1.0 + spread]))
+    scales_of_windows = ratio * np.array([1.0 - spread, 1.0, 1.0 + spread])
+    fits = SimpleNamespace(scale=scales_of_windows, weight=np.ones(3) if weight is None else weight)
     wide = PathScale(3.0, 0.1, 9.0, 5, "truth"), fits
     found = PathScale(ratio, ratio - half, ratio + half, 12, source), fits
     monkeypatch.setattr(scale, "scales", lambda _: [wide, found])
@@ -222,6 +224,19 @@ def test_units_of_speeds(drive: Recording, monkeypatch: pytest.MonkeyPatch, name
     (finding,) = judged(other, monkeypatch, factor)
     assert f"look like {name}:" in finding.what
     assert finding.fix == f"multiply them by {factor:.6g}"
+
+
+@pytest.mark.parametrize(("weight", "code"), [(None, "wheel-scale"), ([0.001, 1.0, 0.001], "wheel-unit")])
+def test_short_windows_do_not_make_a_ratio_uneven(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, weight: list[float] | None, code: str
+) -> None:
+    """Beside coarse fixes the robot's first metres have a scale of their own."""
+    assert drive.wheels is not None
+    fast = dataclasses.replace(drive.wheels, speed=drive.wheels.speed * 180.0 / np.pi)
+    degrees = dataclasses.replace(drive, command=None, wheels=fast)
+    weights = None if weight is None else np.array(weight)
+    found = judged(degrees, monkeypatch, np.pi / 180.0, spread=0.6, weight=weights)
+    assert codes(found) == [code]
 
 
 def test_a_command_decides_between_units(drive: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -262,3 +262,35 @@ def test_few_fixes_and_then_none_hold_samples_for_a_while_only() -> None:
         held = max(held, len(estimator.imu.t_ns))
     assert held <= 21 * 50
     assert estimator.status == "no_gnss"
+
+
+@pytest.mark.parametrize(("fixes", "status"), [(2, "no_gnss"), (6, "outage")])
+def test_a_robot_that_drives_on_without_fixes_starts_where_the_few_there_were_place_it(
+    fixes: int, status: str
+) -> None:
+    """Their heading is too rough to start with at once, and none comes that would tell it."""
+    estimator = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", start_without_gnss_s=5.0))
+    rng = np.random.default_rng(0)
+    for t_ns in range(0, 12_000_000_000, 20_000_000):
+        if t_ns < 200_000_000 * fixes and t_ns % 200_000_000 == 0:
+            estimator.add_gnss(t_ns, np.array([30.0, 7.0, 0.0]) + rng.normal(size=3), 2.0)
+        estimator.add_wheels(t_ns, 0.5, 0.5)
+        estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
+    state = estimator.latest()
+    assert state is not None
+    assert state.status == status
+    if fixes == 6:
+        off_m = state.position_m[:2] - [30.0, 7.0]
+        assert abs(np.hypot(*off_m) - 6.0) < 3.0
+        assert off_m @ np.linalg.solve(state.covariance[:2, :2], off_m) < 9.21
+
+
+def test_an_imu_that_falls_silent_stalls_the_estimator() -> None:
+    estimator = Estimator(
+        EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=SensorConfig(gnss=False))
+    )
+    for t_ns in range(0, 6_000_000_000, 20_000_000):
+        estimator.add_wheels(t_ns, 0.5, 0.5)
+        if t_ns < 3_000_000_000:
+            estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
+        assert (estimator.status == "stalled") == (t_ns > 4_980_000_000)

@@ -145,6 +145,27 @@ def test_robots_of_one_type_share_their_grounds() -> None:
     assert both.grounds[0].windows > two_grounds(1).grounds[0].windows
 
 
+def test_a_memory_given_twice_counts_once() -> None:
+    one = two_grounds(1)
+    both = merged([one, one.named({"ground 1": "lawn"}), one])
+    assert [g.windows for g in both.grounds] == sorted((g.windows for g in one.grounds), reverse=True)
+
+
+def test_a_full_memory_counts_what_it_leaves_out() -> None:
+    rng, memory = np.random.default_rng(5), GroundMemory()
+    for i in range(MOST_GROUNDS):
+        ground = Ground.new(f"ground {i + 1}")
+        for _ in range(40):
+            ground = ground.seen(signature(ROUGH, rng), 1.0, "")
+        memory.grounds.append(ground)
+    memory = memory.copy()
+    for _ in range(60):
+        memory.recognise(signature(SMOOTH, rng), 0.5)
+        memory.learn("")
+    assert len(memory) == MOST_GROUNDS
+    assert memory.left_out > 40
+
+
 def test_many_grounds_of_several_robots_still_fit_into_a_file(tmp_path: Path) -> None:
     """Those that were seen longest are kept."""
     levels = np.linspace(-4.0, 4.0, MOST_GROUNDS + 3)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest, TimeJump
+from terrafusion.fusion.inputs.sample_stream import Lateness
+from terrafusion.fusion.inputs.time_jumps import ClockJumpError, EarlyFixes, Newest, TimeJump
 from terrafusion.fusion.inputs.validation import GnssFix
 
 MS, S = 1_000_000, 1_000_000_000
@@ -189,6 +190,52 @@ def test_fixes_that_contradict_for_five_seconds_are_an_error() -> None:
     with pytest.raises(DataError, match=r"60\.0 s ahead of the fixes, which go on as before"):
         jump.admitted((NOW + 65100 * MS + 1,))
     assert jump.dropped == dropped + 2  # the one that was held, and this one
+
+
+def test_a_clock_that_jumps_alone_is_no_reason_to_start_anew() -> None:
+    jump = TimeJump(running(), "wheels")
+    for k in range(52):
+        assert jump.admitted((NOW + 60 * S + k * 100 * MS,)) == []
+        jump.newest.advance(NOW + (k + 1) * 100 * MS)
+    with pytest.raises(DataError, match=r"60\.0 s ahead of other sensors") as found:
+        jump.admitted((NOW + 65200 * MS,))
+    assert not isinstance(found.value, ClockJumpError)
+
+
+def set_back(by_ns: int, alone: bool, late: int = 60) -> int:
+    """How many of the `late` samples in order after a set-back are accepted, until one is refused."""
+    stream = Lateness("imu", Newest())
+    times = [k * 10 * MS for k in range(1000)]
+    for t_ns in times:
+        stream.jump.newest.advance(t_ns)
+    for k in range(late):
+        if alone:
+            stream.jump.newest.advance(times[-1] + k * 10 * MS)
+        try:
+            assert stream.place(times[-1] - by_ns + k * 10 * MS, times) is not None
+        except ClockJumpError:
+            assert not alone
+            return k
+        except DataError:
+            assert alone
+            return k
+    return late
+
+
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize(("by_ns", "accepted"), [(1500 * MS, 50), (4 * S, 50), (990 * MS, 60)])
+def test_a_clock_that_is_set_back_is_an_error_after_half_a_second(
+    by_ns: int, accepted: int, alone: bool
+) -> None:
+    assert set_back(by_ns, alone) == accepted
+
+
+def test_samples_of_a_clock_far_behind_the_keyframes_are_refused() -> None:
+    stream = Lateness("wheels", Newest())
+    stream.used_ns = NOW
+    assert stream.place(NOW - S, [NOW - 2 * S]) == 1
+    with pytest.raises(DataError, match=r"1\.500 s after its time has been estimated"):
+        stream.place(NOW - 1500 * MS, [NOW - 2 * S])
 
 
 def test_a_clock_that_returns_is_no_error() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -68,15 +69,18 @@ def test_stamps_that_leap_without_a_pause_start_the_estimator_anew(messages: lis
     assert times[-1] - times[0] > 3600 * 10**9, "the new clock is used"
 
 
-def test_stamps_that_leave_those_of_the_fixes_start_the_estimator_anew(messages: list[BagMessage]) -> None:
-    """All are behind the time of receipt: the fixes, once a second, show that no pause is passing."""
+@pytest.mark.parametrize("nth", [1, 5])
+def test_stamps_that_leave_those_of_the_fixes_start_the_estimator_anew(
+    messages: list[BagMessage], nth: int
+) -> None:
+    """All are behind the time of receipt: fixes of 5 or 1 Hz show that no pause is passing."""
     run, begin, late_ns, fixes = Run(frequency=1.0), messages[0][0] + 4 * 10**9, 10**12, 0
     for jumps in (False, True):
         some = []
         for message in messages[: 4 * len(messages) // 5]:
             t, topic, msgtype, cdr = message
             fixes += topic == "/fix"
-            if (t >= begin) is jumps and topic != "/fix_velocity" and (topic != "/fix" or fixes % 5 == 0):
+            if (t >= begin) is jumps and topic != "/fix_velocity" and (topic != "/fix" or fixes % nth == 0):
                 cdr = ahead(message, 100)[-1] if jumps and topic != "/fix" else cdr
                 some.append((t + late_ns, topic, msgtype, cdr))
         run.feed(some, close=False)

@@ -9,14 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.grounds.ground import Ground, Tally
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.ground_slip import GroundSlip
+from terrafusion.twin.model.vehicle import load_vehicle
 
 WHOLE = (0.05, 0.09, 0.4, 10.0)
 """Mean, 1 sigma, slope over the grade and correlation time (s) of the slip of a whole drive."""
 
 
-def belief(ground: int, grounds: int = 2) -> np.ndarray:
+def belief(ground: int, grounds: int = 3) -> np.ndarray:
     """Certain of one ground; 0 is one that was never met."""
     return np.eye(1 + grounds)[ground]
 
@@ -96,3 +99,14 @@ def test_a_memory_that_the_drive_contradicts_is_forgotten() -> None:
         slip.learn(0.02, 0.02, 0.0, 0.5)
     slip.recognise(belief(1))
     assert slip.mean == pytest.approx(0.02, abs=0.03)
+
+
+def test_grounds_that_slip_alike_are_named_together() -> None:
+    config = EstimatorConfig(load_vehicle("husky").rig(), "husky")
+    noise = TerrainNoise(config)
+    assert noise.grounds is not None
+    noise.grounds.memory.grounds = [Ground.new(f"ground {i}") for i in (1, 2, 3)]
+    noise._ground_slip = driven({1: 0.05, 2: 0.2, 3: 0.06})
+    assert noise.found_grounds() == ["ground 1 and ground 3 0.05", "ground 2 0.19"]
+    noise._ground_slip = driven({1: 0.05, 3: 0.06})
+    assert noise.found_grounds() == []

@@ -12,8 +12,10 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -58,6 +60,16 @@ RECORDED = {
 
 def noise_of(vehicle: str = "husky", **options: object) -> TerrainNoise:
     return TerrainNoise(EstimatorConfig(as_vehicle(vehicle).rig(), vehicle, **options))  # type: ignore[arg-type]
+
+
+def test_a_policy_of_other_grounds_than_the_detector_knows_is_noted() -> None:
+    rig, shipped = as_vehicle("elevate").rig(), load_policy()
+    lawn = dataclasses.replace(
+        shipped, classes={"lawn": shipped.classes["asphalt"], "unknown": shipped.classes["unknown"]}
+    )
+    for policy, noted in ((shipped, False), (lawn, True)):
+        notes = notes_of(Estimator(EstimatorConfig(rig, "elevate", policy=policy)))
+        assert any("none of the grounds that the terrain model knows" in note for note in notes) is noted
 
 
 def test_a_switch_is_the_share_that_changed_ground_since_it_was_last_asked() -> None:
