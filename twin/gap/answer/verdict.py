@@ -155,7 +155,7 @@ def credible_members(
             continue
         members += [name] if name != effect else []
         sum_ += instead[name]
-    same = alike.get(effect, set()) - {*members, *best}
+    same = sorted(alike.get(effect, set()) - {*members, *best})  # a set has no order of its own
     return (*members, *sorted(same, key=lambda name: -instead.get(name, 0.0)))
 
 
