@@ -38,6 +38,15 @@ def test_nonsense_is_refused(references: list[Recording]) -> None:
             diagnose(references[:1], references[1:], VEHICLE, significance=significance)
 
 
+def test_a_soil_for_a_ground_that_no_log_has_is_refused(references: list[Recording]) -> None:
+    given = {"gravel": "gravel", "grvel": "mud"}
+    with pytest.raises(ConfigError, match="no log drives on 'gravel'; their grounds: loose_sand"):
+        prepared(references[:1], VEHICLE, given)
+    unnamed = dataclasses.replace(references[0], terrain=None, terrain_name="")
+    with pytest.raises(ConfigError, match="they name none, so give one soil for all logs"):
+        prepared([unnamed], VEHICLE, given)
+
+
 def test_channels_that_a_log_lacks_are_noted_as_left_out(references: list[Recording]) -> None:
     bare = dataclasses.replace(references[1], gnss=None)
     logs, _, notes = prepared([references[0], bare], VEHICLE, None)
