@@ -107,7 +107,7 @@ def judge(
     unknown = unknown if detected else 0.0
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}
-    best = most_probable(sets)
+    best = most_probable(sets, found.evidence)
     classes = {
         effect: credible_members(effect, best, sets, found.alike) for effect in (best if detected else ())
     }
@@ -129,13 +129,14 @@ def judge(
     )
 
 
-def most_probable(sets: Mapping[Sets, float]) -> Sets:
-    """The most probable set of the most probable number of effects."""
+def most_probable(sets: Mapping[Sets, float], evidence: Mapping[Sets, float]) -> Sets:
+    """The most probable set of the most probable number of effects; of equals that of most log evidence: an
+    unknown cause may be so much more probable that all sets are equal to the last bit."""
     by_count: dict[int, float] = {}
     for name, p in sets.items():
         by_count[len(name)] = by_count.get(len(name), 0.0) + p
     count = max(by_count, key=lambda k: by_count[k])
-    return max((name for name in sets if len(name) == count), key=lambda name: sets[name])
+    return max((name for name in sets if len(name) == count), key=lambda name: (sets[name], evidence[name]))
 
 
 def credible_members(
@@ -184,7 +185,7 @@ def _causes(
             weight[effect] += p
     most = max(fit.gain for fit in found.fits.values())
     out = []
-    for effect in sorted(weight, key=lambda effect: (-weight[effect], candidates.effects.index(effect))):
+    for effect in sorted(weight, key=lambda effect: (-weight[effect], -found.evidence[effect,])):
         alone = found.fits[effect,]
         fit = found.fits[best] if effect in best else alone
         k = next(k for k, law in enumerate(fit.laws) if law.effect == effect)
