@@ -114,6 +114,8 @@ def gap(
     changes = [] if write_vehicle is None else write_corrected(found, robot, write_vehicle)
     written = write_vehicle if changes and found.verdict.named else None
     lines = answer(found, out, written)
+    if write_vehicle is not None and written is None:
+        lines.append(f"No effect was named, so {write_vehicle} was not written.")
     document = common.read_json(out / "diagnosis.json")
     more, short = [*changes, *details(found)], f"{verdict_line(found)} Written to {out}"
     return Result([*compared, *lines], "", document, details=more, short=short)

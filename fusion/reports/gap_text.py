@@ -151,7 +151,7 @@ def details(d: GapDiagnosis) -> list[str]:
         for c in significant_places(d)[:MOST_LISTED]
     ]
     for cause in d.verdict.causes[:MOST_LISTED]:
-        share = "" if cause.share is None else f", explains {percent(cause.share)}"
+        share = "" if cause.share is None else f", explains {percent(cause.share)} of what the best do"
         lines.append(f"cause: {cause.effect}, {percent(cause.probability)}{share} ({numbers(d, cause)})")
     s = d.shrinkage
     floor = "" if s.floor is None else f", references {s.floor:.3g}"
