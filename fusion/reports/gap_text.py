@@ -40,9 +40,10 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
 
 def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:
     """Sentences by title, none without any; at most so many places, explained effects and channels."""
+    lost = [note for note in d.notes if "left out" in note]
     found = {
-        "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most),
-        "Next": _next(d), "Load": _load(corrected) if d.verdict.named else [], "Runs": [_compared(d)],
+        "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most), "Next": _next(d),
+        "Load": _load(corrected) if d.verdict.named else [], "Runs": [_compared(d), *lost],
     }  # fmt: skip
     return {title: sentences for title, sentences in found.items() if sentences}
 
@@ -236,7 +237,9 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
         how = "by an unknown share: there are no references to compare with"
     elif s.share is None:
         how = "by an unknown share: with ground and offsets refitted, samples differ as references do"
-        if d.verdict.left > MOST_LEFT:
+        if d.verdict.left is None:
+            how += ", and so do whole runs; doubt the cause"
+        elif d.verdict.left > MOST_LEFT:
             how += "; doubt the cause"
         else:
             how += f". Of the gap over whole runs the cause explains {percent(1.0 - d.verdict.left)}"

@@ -59,7 +59,7 @@ class CredibleSet:
 class GapVerdict:
     """The verdict, its named effects, all causes and credible sets, the most probable first; `fit` is that of
     the named effects, `log_odds` those of any effect against none, `left` the share of the gap that the named
-    ones leave."""
+    ones leave, None where whole runs show no excess."""
 
     kind: str
     named: tuple[str, ...]
@@ -69,7 +69,7 @@ class GapVerdict:
     p_unknown: float
     fit: Fitted | None
     log_odds: float = 0.0
-    left: float = 0.0
+    left: float | None = 0.0
 
     def ambiguous(self) -> Cause | None:
         """The most probable of the named causes that cannot be distinguished from others."""
@@ -79,7 +79,7 @@ class GapVerdict:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
         well, as it may come from these, or where the test is not `significant` at a stricter threshold. An
         unknown cause stands where it is `sure` that there is one."""
-        explained = self.kind != "unknown" and self.log_odds >= 0.0 and self.left <= MOST_LEFT
+        explained = self.kind != "unknown" and self.log_odds >= 0.0 and (self.left or 0.0) <= MOST_LEFT
         if (significant and explained) or (sure and self.kind == "unknown"):
             return self
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
@@ -125,7 +125,7 @@ def judge(
     kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
     return GapVerdict(
-        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best, 0.0)
+        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best)
     )
 
 
