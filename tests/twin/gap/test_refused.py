@@ -53,3 +53,12 @@ def test_channels_that_a_log_lacks_are_noted_as_left_out(references: list[Record
     assert [len(log.observed) for log in logs] == [len(logs[1].observed)] * 2
     assert any("run101" in note and "gnss_east_m" in note for note in notes)
     assert not any("left out" in note for note in prepared(references[:2], VEHICLE, None)[2])
+
+
+def test_a_dead_sensor_is_left_out_and_named(references: list[Recording]) -> None:
+    """A current of zero was a robot of half its mass, 98 % certain, a dead gyro a gyro scale of a half."""
+    assert references[1].motor is not None
+    motor = dataclasses.replace(references[1].motor, current_a=0.0 * references[1].motor.current_a)
+    logs, _, notes = prepared([references[0], dataclasses.replace(references[1], motor=motor)], VEHICLE, None)
+    assert notes == ["left out, as dead in run101: current_left_a, current_right_a"]
+    assert all(not o.channel.startswith("current") for log in logs for o in log.observed)
