@@ -6,13 +6,14 @@ from numbers import Real
 from pathlib import Path
 
 from terrafusion.datasets.core.arguments import checked_names, checked_whole
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.reports.gap import write_diagnosis
 from terrafusion.fusion.reports.gap_text import answer
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.diagnose import diagnose as run
+from terrafusion.twin.model.choose import vehicle_of_logs
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
@@ -47,7 +48,7 @@ def diagnose(
     runs: Log | Sequence[Log],
     *,
     references: Log | Sequence[Log] = (),
-    vehicle: str | Path | VehicleParams = "elevate",
+    vehicle: str | Path | VehicleParams | None = None,
     terrain: Soils = None,
     effects: str | Sequence[str] | None = None,
     significance: float = 0.05,
@@ -59,7 +60,7 @@ def diagnose(
     Args:
         runs: one log or several: the robot as it is now.
         references: logs that count as normal; none: replicates of the twin stand in for them.
-        vehicle: the twin's vehicle: name, YAML file or `Vehicle`.
+        vehicle: the twin's vehicle: name, YAML file or `Vehicle`; None: the logs'.
         terrain: ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
         effects: candidate or candidates by name; None: the whole catalogue.
         significance: threshold of the test for a gap.
@@ -70,14 +71,20 @@ def diagnose(
         ConfigError: an unknown effect, soil or vehicle.
         DataError: a log without what the diagnosis needs, or given twice.
     """
-    params, seed = as_vehicle(vehicle), checked_whole(seed, "seed")
+    seed = checked_whole(seed, "seed")
     if not isinstance(significance, Real):
         raise ConfigError(f"'significance' is {significance!r}", remedy="give a number from 0.001 to 0.5")
-    judged, normal = opened(runs, params.rig()), opened(references, params.rig())
+    rig = None if vehicle is None else as_vehicle(vehicle).rig()
+    judged, normal = opened(runs, rig), opened(references, rig)
+    if not judged:
+        raise DataError("no run to diagnose was given", remedy="give at least one")
+    robot, assumed = vehicle_of_logs([*judged, *normal], vehicle)
+    params = as_vehicle(robot)
+    judged, normal = opened(judged, params.rig()), opened(normal, params.rig())
     result = run(
         judged, normal, params, terrain,
         effects=None if effects is None else checked_names(effects, "effects"),
         significance=significance, seed=seed,
         progress=progress,
     )  # fmt: skip
-    return Diagnosis(**vars(result))
+    return Diagnosis(**{**vars(result), "notes": (*assumed, *result.notes)})

@@ -57,7 +57,7 @@ def gap(
     runs: RunsArgument,
     out: Path,
     reference: list[str] | None = None,
-    vehicle: str = "elevate",
+    vehicle: str | None = None,
     terrain: list[str] | None = None,
     effects: str | None = None,
     significance: float = 0.05,
@@ -79,7 +79,7 @@ def gap(
 
     Args:
         reference (REF): Runs that count as normal; repeat for more. None: twin.
-        vehicle: The twin's vehicle, by name or YAML file.
+        vehicle: The twin's vehicle, by name or YAML file. Default: the logs'.
         terrain (SOIL|LABEL=SOIL): Ground of all logs, or of one label.
         effects: Candidates by name, with commas. Default: the whole catalogue.
         significance: False alarms accepted, 0.001 to 0.5.
@@ -90,26 +90,32 @@ def gap(
     from terrafusion.fusion.reports.gap_text import answer, details, verdict_line
     from terrafusion.twin.gap.answer.corrected import write_corrected
     from terrafusion.twin.gap.diagnose import diagnose
+    from terrafusion.twin.model.choose import vehicle_of_logs
     from terrafusion.twin.model.vehicle import load_vehicle
 
     rig = common.load_rig(vehicle)
     judged, normal = (_opened_by_name(names, how, rig) for names in (runs, reference or []))
+    named, assumed = vehicle_of_logs([*judged, *normal], vehicle)
+    robot = str(named)
     with common.progress_bar("comparing") as progress:
         found = diagnose(
-            judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
+            judged, normal, load_vehicle(robot), parse_terrain(terrain),
             effects=None if effects is None else split(effects), significance=significance, source=source,
             seed=seed, progress=progress,
         )  # fmt: skip
+    found = dataclasses.replace(found, notes=(*assumed, *found.notes))
     scores = None
     if judge:
         from terrafusion.fusion.benchmark.estimator_gap import estimator_gap, estimator_scorer
 
-        scores = estimator_gap(found, judged, normal, estimator_scorer(vehicle), seed)
+        scores = estimator_gap(found, judged, normal, estimator_scorer(robot), seed)
     compared = [] if scores is None else [_line(score) for score in scores[0]]
     write_diagnosis(out, found, {"command": common.command_line()}, scores)
-    changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
+    changes = [] if write_vehicle is None else write_corrected(found, robot, write_vehicle)
     written = write_vehicle if changes and found.verdict.named else None
     lines = answer(found, out, written)
+    if write_vehicle is not None and written is None:
+        lines.append(f"No effect was named, so {write_vehicle} was not written.")
     document = common.read_json(out / "diagnosis.json")
     more, short = [*changes, *details(found)], f"{verdict_line(found)} Written to {out}"
     return Result([*compared, *lines], "", document, details=more, short=short)

@@ -40,9 +40,10 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
 
 def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:
     """Sentences by title, none without any; at most so many places, explained effects and channels."""
+    lost = [note for note in d.notes if "left out" in note]
     found = {
-        "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most),
-        "Next": _next(d), "Load": _load(corrected) if d.verdict.named else [], "Runs": [_compared(d)],
+        "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most), "Next": _next(d),
+        "Load": _load(corrected) if d.verdict.named else [], "Runs": [_compared(d), *lost],
     }  # fmt: skip
     return {title: sentences for title, sentences in found.items() if sentences}
 
@@ -151,7 +152,7 @@ def details(d: GapDiagnosis) -> list[str]:
         for c in significant_places(d)[:MOST_LISTED]
     ]
     for cause in d.verdict.causes[:MOST_LISTED]:
-        share = "" if cause.share is None else f", explains {percent(cause.share)}"
+        share = "" if cause.share is None else f", explains {percent(cause.share)} of what the best do"
         lines.append(f"cause: {cause.effect}, {percent(cause.probability)}{share} ({numbers(d, cause)})")
     s = d.shrinkage
     floor = "" if s.floor is None else f", references {s.floor:.3g}"
@@ -236,7 +237,9 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
         how = "by an unknown share: there are no references to compare with"
     elif s.share is None:
         how = "by an unknown share: with ground and offsets refitted, samples differ as references do"
-        if d.verdict.left > MOST_LEFT:
+        if d.verdict.left is None:
+            how += ", and so do whole runs; doubt the cause"
+        elif d.verdict.left > MOST_LEFT:
             how += "; doubt the cause"
         else:
             how += f". Of the gap over whole runs the cause explains {percent(1.0 - d.verdict.left)}"

@@ -316,7 +316,7 @@ def certainty(sets: Sequence[Mapping[str, Any]], head: Head) -> Reliability:
             known, unknown = probabilities(found, effects, head, p)
             certain = (1.0 - null_probability(p)) * (1.0 - unknown) / sum(known.values())
             known = {name: certain * q for name, q in known.items()}
-            best = most_probable(known)
+            best = most_probable(known, found.evidence)
             first = credible_sets({e: credible_members(e, best, known, found.alike) for e in best}, known)[0]
             stated.append(first.probability)
             true.append(bool({*first.effects} & {*truth}))

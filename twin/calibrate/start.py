@@ -65,9 +65,10 @@ def start_model(
                     raise _no_soil(label, recording) from None
                 found[label] = load_soil(stand_in)
                 notes.append(f"the ground '{label}' is not in the library: {stand_in} stands in")
-    if stand_in is None and (unmet := sorted(set(given) - set(found))):
+    if unmet := sorted(set(given) - set(found)):
+        theirs = ", ".join(filter(None, found)) or "they name none, so give one soil for all logs"
         raise ConfigError(
-            f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {', '.join(found)}"
+            f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {theirs}"
         )
     return Model(robot, found, present), None, notes
 

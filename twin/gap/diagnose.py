@@ -6,6 +6,7 @@ data -> rollout -> null -> infer -> answer
 from collections.abc import Callable, Sequence
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.calibrate.start import Soils
@@ -38,7 +39,7 @@ HALF_COVERED = 0.5
 """Share of the judged time that references cover, from which drives alone make no p-value as low as the
 finest (assumed, with robots 112 to 134 of the study `unseen_gap` in view)."""
 TOO_FEW = (
-    "{} reference runs, of at least {} that show how runs scatter: twin replicates stand in, and false "
+    "{}, of at least {} that show how runs scatter: twin replicates stand in, and false "
     "alarms are as frequent as the twin is wrong (uncalibrated)"
 )
 
@@ -109,7 +110,7 @@ def diagnose_evidence(
     scores = [score(run, sigma) for run in runs]
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
-        notes.append(TOO_FEW.format(len(normal), FEWEST))
+        notes.append(TOO_FEW.format(counted(len(normal), "reference run"), FEWEST))
         in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
     offsets = learn_offsets(normal, len(candidates.keys), evidence.jobs, of_twin=uncalibrated)

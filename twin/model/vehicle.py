@@ -300,7 +300,8 @@ def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
                 f"it reports another geometry of the vehicle ({listed_overrides(recording.overrides)}) than "
                 f"{first.name} ({listed_overrides(first.overrides)})",
                 file=recording.name,
-                remedy=f"give logs of one vehicle, or the same {' and '.join(differing)} in their meta.yaml",
+                remedy=f"give logs of one vehicle, or the same {' and '.join(differing)} in their meta.yaml "
+                "(`terrafusion convert` makes a folder with one of a bag)",
             )  # fmt: skip
     return reported
 

@@ -40,11 +40,11 @@ def plot_map(sheet: Sheet, d: GapDiagnosis) -> None:
 
 
 def plot_causes(sheet: Sheet, d: GapDiagnosis) -> None:
-    """Share of the gap that each of the first causes explains by itself, with its probability."""
+    """What each of the first causes explains by itself of what the best do, with its probability."""
     causes = [c for c in d.verdict.causes if c.share is not None][:MOST_CAUSES]
     alike = {name for s in d.verdict.sets if s.named for name in s.effects}
     names = [f"{c.effect} ({100.0 * c.probability:.0f} %)" for c in causes]
-    x = "share of the gap that it explains by itself, %"
+    x = "explained by itself, % of what the best effects explain"
     plot = sheet.add_rows("rows causes", x, names, x_range=(0.0, 105.0))
     kinds = ["named" if c.effect in d.verdict.named else "alike" if c.effect in alike else "" for c in causes]
     for kind, label, colour in (

@@ -13,6 +13,7 @@ import terrafusion as tf
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.readers.logs import opened
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.api import diagnoses
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.assumptions import assumptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
@@ -108,6 +109,23 @@ def test_one_name_needs_no_list(log: tf.Recording, tmp_path: Path) -> None:
         tf.diagnose(log, effects="wheels")
     with pytest.raises(tf.ConfigError, match="unknown family 'mixd'"):
         tf.benchmark(tmp_path, only="mixd")
+
+
+def test_a_diagnosis_takes_the_vehicle_of_its_logs(
+    log: tf.Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It took `elevate` for any robot, without a word."""
+    husky, unnamed = (dataclasses.replace(log, name=name, vehicle=name) for name in ("husky", ""))
+    taken: list[str] = []
+    monkeypatch.setattr(diagnoses, "run", lambda a, b, vehicle, *_, **__: taken.append(vehicle.name) or 1 / 0)
+    for vehicle in (None, "warthog"):
+        with pytest.raises(ZeroDivisionError):
+            tf.diagnose(husky, references=[husky], vehicle=vehicle)
+    assert taken == ["husky", "warthog"]
+    with pytest.raises(tf.DataError, match="names no vehicle, and the log lacks its wheel_radius_m"):
+        tf.diagnose(unnamed)
+    with pytest.raises(tf.DataError, match="give logs of one vehicle"):
+        tf.diagnose(husky, references=log)
 
 
 def test_counts_and_names_are_of_their_types(log: tf.Recording, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import sys
@@ -77,7 +78,13 @@ def test_gap_writes_answer_report_and_corrected_vehicle(
     verbose = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"), "--verbose")
     assert "wheel.radius_m" in verbose.out
     assert "cause: mass" in verbose.out
+    assert "of what the best do" in verbose.out
     assert (tmp_path / "corrected.yaml").is_file()
+    nothing = dataclasses.replace(found[0].verdict, kind="no_gap", named=())
+    found[0] = dataclasses.replace(found[0], verdict=nothing)
+    unwritten = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "other.yaml"))
+    assert f"No effect was named, so {tmp_path / 'other.yaml'} was not written." in unwritten.out
+    assert not (tmp_path / "other.yaml").exists()
 
 
 def test_every_effect_has_one_sentence_what_it_is_and_one_how_to_check_it() -> None:

@@ -56,10 +56,11 @@ def test_sizes_that_grow_with_the_robot_say_for_which_they_are() -> None:
         (0.6, (0.0, 1.0), 0.1, True),
         (None, None, 0.9, True),
         (None, None, 0.1, False),
+        (None, None, None, True),  # it was said to explain over 99 % of nothing
     ],
 )
 def test_a_cause_that_removes_no_error_for_sure_is_doubted(
-    share: float | None, interval: tuple[float, float] | None, left: float, doubted: bool
+    share: float | None, interval: tuple[float, float] | None, left: float | None, doubted: bool
 ) -> None:
     shrink = SimpleNamespace(floor=1.0, share=share, interval=interval, physical={}, channels={})
     verdict = SimpleNamespace(named=("mass",), left=left)

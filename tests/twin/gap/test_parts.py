@@ -263,7 +263,8 @@ def test_the_geometry_that_logs_tell_is_said_and_has_to_be_one() -> None:
     assert notes == ["the log's own geometry is used: wheel_radius_m = 0.17"]
     assert prepared([plain], vehicle, None)[2] == []
     another = (
-        rf"told: it reports another geometry .* \(wheel_radius_m = 0.17\) than {plain.name} \(none\); give"
+        rf"told: it reports another geometry .* \(wheel_radius_m = 0.17\) than {plain.name} \(none\); "
+        r"give.*`terrafusion convert`"
     )
     with pytest.raises(DataError, match=another):
         prepared([plain, told], vehicle, None)

@@ -105,9 +105,10 @@ class Planner:
         if enough:
             mass = PAYLOAD_SHARE * self.evidence.model.vehicle.body.mass_kg
             load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" * (PAYLOAD in best)
+            parts = in_words(drives()[best], self.evidence.model.vehicle.drive.max_speed_mps)
             why = (
-                f"of {len(drives())} drives simulated, this one separates {pair[0]} from {pair[1]} best: by "
-                f"{apart}, together with these runs; drive it {times(enough[0])}{load}"
+                f"{parts}. Of {len(drives())} drives simulated, this one separates {pair[0]} from {pair[1]} "
+                f"best: by {apart}, together with these runs; drive it {times(enough[0])}{load}"
             )
         else:
             scenario, why = (
@@ -146,6 +147,19 @@ class Planner:
                 ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]
                 information[ground, :] = information[:, ground] = 0.0
         return out
+
+
+def in_words(scenario: Scenario, max_speed_mps: float) -> str:
+    """What a drive commands, one part after the other, no faster than the robot goes."""
+    parts = list[str]()
+    for s in scenario.drive:
+        v_mps = float(np.clip(s.v_mps, -max_speed_mps, max_speed_mps))
+        wave = f", {1.0 / s.period_s:.2g} to {1.0 / max(s.end_period_s, 1e-9):.2g} Hz"
+        swings = [(v_mps, s.v_amplitude_mps, "m/s"), (s.yaw_rate_radps, s.yaw_rate_amplitude_radps, "rad/s")]
+        twist = [f"{x:g}{f' +- {a:g}' if a else ''} {unit}" for x, a, unit in swings if x or a]
+        waves = s.v_amplitude_mps or s.yaw_rate_amplitude_radps
+        parts += [f"{s.duration_s:.2g} s at {', '.join(twist)}{wave if waves else ''}"] if twist else []
+    return "; ".join(parts)
 
 
 def _explained(information: Array, signal: Array, columns: Sequence[int]) -> float:

@@ -63,7 +63,7 @@ def shrinkage(
     """Shrinkage by fitted effects; zero without any. `left_out` is that of the explanation."""
     runs, references = evidence.runs, evidence.references
     was = [own_error(run, robot) for run in runs]
-    now = was if fit is None else _errors_left_out(evidence, robot, fit, left_out(fit), was)
+    now = was if fit is None else _errors_left_out(evidence, sigma, robot, fit, left_out(fit), was)
     free = [_mean_square(r.without_states(FREE * sigma, e)) for r, e in zip(runs, was, strict=True)]
     arms = [
         [(r, r.without_states(sigma, e)) for r, e in zip(some, errors, strict=True)]
@@ -107,13 +107,22 @@ def _by_channel(
 
 
 def _errors_left_out(
-    evidence: GapEvidence, robot: RobotOffsets, fit: Fitted, values: list[tuple[Array, ...]], was: list[Array]
-) -> list[Array]:
-    """Errors of each run with the effect at its values fitted to the other runs."""
-    changed = evidence.candidates.changed
-    tried = [RunWithEffects(i, changed(fit.columns, np.concatenate(x))) for i, x in enumerate(values)]
-    errors = zip(evidence.runs, whitened_errors(evidence, tried), was, strict=True)
-    return [before if e is None else e - run.by_parameter @ robot.mean for run, e, before in errors]
+    evidence: GapEvidence, sigma: Array, robot: RobotOffsets, fit: Fitted, values: list[tuple[Array, ...]],
+    was: list[Array],
+) -> list[Array]:  # fmt: skip
+    """Errors of each run with the effect at its values fitted to the other runs, on the better of two soils:
+    the one that fits the run without the effect may hold a part of it, the references' holds none."""
+    runs, tried = evidence.runs, list[RunWithEffects]()
+    for i, x in enumerate(values):
+        effects = evidence.candidates.changed(fit.columns, np.concatenate(x))
+        tried += [RunWithEffects(i, effects), RunWithEffects(i, effects, np.zeros(len(evidence.soil_limit)))]
+    found = whitened_errors(evidence, tried)
+    out = list[Array]()
+    for run, before, *both in zip(runs, was, found[::2], found[1::2], strict=True):
+        errors = [e - run.by_parameter @ robot.mean for e in both if e is not None]
+        left = [_mean_square(run.without_states(sigma, e)) for e in errors]
+        out.append(errors[int(np.argmin(left))] if errors else before)
+    return out
 
 
 def _share(

@@ -59,7 +59,7 @@ class CredibleSet:
 class GapVerdict:
     """The verdict, its named effects, all causes and credible sets, the most probable first; `fit` is that of
     the named effects, `log_odds` those of any effect against none, `left` the share of the gap that the named
-    ones leave."""
+    ones leave, None where whole runs show no excess."""
 
     kind: str
     named: tuple[str, ...]
@@ -69,7 +69,7 @@ class GapVerdict:
     p_unknown: float
     fit: Fitted | None
     log_odds: float = 0.0
-    left: float = 0.0
+    left: float | None = 0.0
 
     def ambiguous(self) -> Cause | None:
         """The most probable of the named causes that cannot be distinguished from others."""
@@ -79,7 +79,7 @@ class GapVerdict:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
         well, as it may come from these, or where the test is not `significant` at a stricter threshold. An
         unknown cause stands where it is `sure` that there is one."""
-        explained = self.kind != "unknown" and self.log_odds >= 0.0 and self.left <= MOST_LEFT
+        explained = self.kind != "unknown" and self.log_odds >= 0.0 and (self.left or 0.0) <= MOST_LEFT
         if (significant and explained) or (sure and self.kind == "unknown"):
             return self
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
@@ -107,7 +107,7 @@ def judge(
     unknown = unknown if detected else 0.0
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}
-    best = most_probable(sets)
+    best = most_probable(sets, found.evidence)
     classes = {
         effect: credible_members(effect, best, sets, found.alike) for effect in (best if detected else ())
     }
@@ -125,17 +125,18 @@ def judge(
     kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
     return GapVerdict(
-        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best, 0.0)
+        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best)
     )
 
 
-def most_probable(sets: Mapping[Sets, float]) -> Sets:
-    """The most probable set of the most probable number of effects."""
+def most_probable(sets: Mapping[Sets, float], evidence: Mapping[Sets, float]) -> Sets:
+    """The most probable set of the most probable number of effects; of equals that of most log evidence: an
+    unknown cause may be so much more probable that all sets are equal to the last bit."""
     by_count: dict[int, float] = {}
     for name, p in sets.items():
         by_count[len(name)] = by_count.get(len(name), 0.0) + p
     count = max(by_count, key=lambda k: by_count[k])
-    return max((name for name in sets if len(name) == count), key=lambda name: sets[name])
+    return max((name for name in sets if len(name) == count), key=lambda name: (sets[name], evidence[name]))
 
 
 def credible_members(
@@ -155,7 +156,7 @@ def credible_members(
             continue
         members += [name] if name != effect else []
         sum_ += instead[name]
-    same = alike.get(effect, set()) - {*members, *best}
+    same = sorted(alike.get(effect, set()) - {*members, *best})  # a set has no order of its own
     return (*members, *sorted(same, key=lambda name: -instead.get(name, 0.0)))
 
 
@@ -184,7 +185,7 @@ def _causes(
             weight[effect] += p
     most = max(fit.gain for fit in found.fits.values())
     out = []
-    for effect in sorted(weight, key=lambda effect: (-weight[effect], candidates.effects.index(effect))):
+    for effect in sorted(weight, key=lambda effect: (-weight[effect], -found.evidence[effect,])):
         alone = found.fits[effect,]
         fit = found.fits[best] if effect in best else alone
         k = next(k for k, law in enumerate(fit.laws) if law.effect == effect)

@@ -4,14 +4,18 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 
+import numpy as np
+
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.start import Soils, start_model
 from terrafusion.twin.model.vehicle import VehicleParams
 
 WINDOW_S = 10.0  # length of a window, at whose start the pose is reset
+SAME = 1e-9  # share of a reading by which one that never changes differs: rounding of its means
 GENERIC_SOIL = "medium_sand"
 """Stands in where a log names no known soil; the references then set its strength."""
 
@@ -40,6 +44,15 @@ def digest(recording: Recording) -> bytes:
     return content.digest()
 
 
+def _is_dead(observed: Observed, log: PreparedLog) -> bool:
+    """Whether a gyro, accelerometer or current sensor reads the same all along, though the robot is driven in
+    turns: that is no effect of the catalogue, and would be named as the largest of one."""
+    sensor = observed.channel.startswith(("yaw_rate", "accel", "current"))
+    turning = bool(np.ptp(log.sides[:, 1] - log.sides[:, 0]) > 0.0)
+    size = float(np.abs(observed.value).max(initial=0.0))
+    return sensor and turning and float(np.ptp(observed.value)) <= SAME * size
+
+
 def prepared(
     recordings: Sequence[Recording], vehicle: VehicleParams, soils: Soils, source: str = "auto"
 ) -> tuple[list[PreparedLog], Model, list[str]]:
@@ -51,6 +64,11 @@ def prepared(
     """
     model, ground, notes = start_model(recordings, vehicle, soils, stand_in=GENERIC_SOIL)
     logs = [prepare(r, model, source=source, window_s=WINDOW_S, ground=ground) for r in recordings]
+    for log in logs:
+        if dead := {o.channel for o in log.observed if _is_dead(o, log)}:
+            notes = [*notes, f"left out, as dead in {log.name}: {', '.join(sorted(dead))}"]
+            kept = [tuple(o for o in own.observed if o.channel not in dead) for own in logs]
+            logs = [dataclasses.replace(own, observed=o) for own, o in zip(logs, kept, strict=True)]
     channels = [{o.channel: o for o in log.observed} for log in logs]
     shared = [o.channel for o in logs[0].observed if all(o.channel in have for have in channels)]
     if not shared:

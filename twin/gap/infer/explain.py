@@ -50,7 +50,8 @@ class Explanation:
         outside: log evidence of a cause outside the catalogue.
         alike: by effect, those whose whole signatures nearly coincide with its own at their sizes.
         left_out: gives the values of a set's best laws fitted without each run, one tuple a run.
-        left: share (0..1) of the gap's excess (`predictive.excess`) that a set leaves, after a close look.
+        left: share (0..1) of the gap's excess (`predictive.excess`) that a set leaves, after a close look;
+            empty without an excess.
     """
 
     evidence: dict[Sets, float]
@@ -228,8 +229,8 @@ def _close_look(
 
     alike = _same_signatures(plain, [found[i,] for i in index])
     every = _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
-    whole = max(excess(look.metric), 1e-9)
-    left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()}
+    whole = excess(look.metric)
+    left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()} if whole else {}
     return dataclasses.replace(every, left=left)
 
 

@@ -29,3 +29,14 @@ def test_a_payload_has_a_moment_of_inertia() -> None:
         at = VEHICLE_PARAMETERS.index(name)
         assert of[1][at] == pytest.approx((1.0 + PAYLOAD_SHARE) * of[0][at])
     assert of[2][VEHICLE_PARAMETERS.index("mass_kg")] == next_run.STAND_MASS_KG
+
+
+def test_a_proposed_drive_says_what_to_command_no_faster_than_the_robot_goes() -> None:
+    """A name alone, such as "speed staircase", can be driven by no one."""
+    drives = next_run.drives()
+    steps = "5 s at 0.3 m/s; 5 s at 0.6 m/s; 5 s at 0.9 m/s; 5 s at 1 m/s; 5 s at 1 m/s"
+    assert next_run.in_words(drives["speed staircase"], 1.0) == steps
+    turns = "14 s at 0.8 m/s, 0.45 rad/s; 14 s at 0.8 m/s, -0.45 rad/s"
+    assert next_run.in_words(drives["figure of eight"], 2.0) == turns
+    chirp = next_run.in_words(drives["chirp, 0.2 to 3 Hz"], 2.0)
+    assert chirp.startswith("13 s at 0.8 +- 0.3 m/s, 0.2 to 3 Hz; ")

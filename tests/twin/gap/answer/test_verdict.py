@@ -76,6 +76,12 @@ def test_effects_of_the_same_signature_are_one_set_whatever_the_evidence() -> No
     assert found.sets[0].effects == ("mass", "track_width")
 
 
+def test_look_alikes_as_improbable_as_each_other_are_in_order_of_their_names() -> None:
+    others = {*NAMES} - {"mass"}
+    found = verdict({("mass",): 2000.0}, alike={"mass": others})  # the others' probabilities are all zero
+    assert found.sets[0].effects == ("mass", *sorted(others))
+
+
 def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     sure = Detection(9.0, 1e-12)
     weak = verdict({("mass",): 2.0}, detection=sure)
@@ -84,6 +90,9 @@ def test_a_gap_that_no_effect_explains_is_of_unknown_cause() -> None:
     assert weak.p_unknown > 0.5
     assert verdict({("mass",): 60.0}, detection=sure).kind == "effect"
     assert verdict({("mass",): 10.0}, outside=60.0).kind == "unknown"
+    far = verdict({("gyro_scale",): 40.0, ("mass",): 30.0}, outside=400.0)  # all are as improbable
+    assert [c.effect for c in far.causes[:2]] == ["gyro_scale", "mass"]  # not in the catalogue's order
+    assert far.sets[0].effects[0] == "gyro_scale"
     none = verdict({("mass",): 60.0}, detection=Detection(1.0, 0.6))
     assert none.kind == "no_gap"
     assert none.p_unknown == 0.0
