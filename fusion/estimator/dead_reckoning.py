@@ -152,7 +152,8 @@ class DeadReckoning:
         if node.wheels is not None and math.isfinite(node.wheels.sigma[0]):
             moved, known = node.wheels.displacement_m, not skids
             speed_mps = max(speed_mps, abs(node.wheels.distance_m) / dt)
-            self._top_mps = max(self._top_mps, speed_mps)
+            if known:  # in a skid the fixes, right or wrong, make the speed
+                self._top_mps = max(self._top_mps, speed_mps)
         else:
             moved, known = R.T @ state.velocity * dt, False
         east, north, _ = (R @ moved).tolist()

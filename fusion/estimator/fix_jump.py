@@ -84,7 +84,7 @@ def exceeds_skid(before: list[FixPair], after: list[FixPair], heading: complex, 
     """
     a, b, c = before[-2], before[-1], after[0]
     speed_mps = abs(b.z - a.z) / (b.t_ns - a.t_ns) * 1e9
-    skidded_m = c.reach_m - b.reach_m + speed_mps * (c.t_ns - b.t_ns) * 1e-9
+    skidded_m = abs(c.z - b.z) + speed_mps * (c.t_ns - b.t_ns) * 1e-9
     sides = [(sum(residual_m(b, one, heading) for one in side) / len(side), side) for side in (before, after)]
     variances_m2 = [scale**2 * max(one.sigma_m for one in side) ** 2 / len(side) for _, side in sides]
     least_m = skidded_m + SKID_SIGMA * math.sqrt(sum(variances_m2))
