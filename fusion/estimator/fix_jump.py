@@ -6,6 +6,7 @@ an acceleration that no ground gives. A skid needs time: it grows while the robo
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Self
 
@@ -71,9 +72,19 @@ class FixJump:
         return cls(offset_m, heading, no_skid or beyond_m > most_m)
 
     def continued(self, last: FixPair, pair: FixPair) -> bool:
-        """Whether a fix follows the `last` one held off along the path."""
+        """Whether a fix follows the `last` one held off along the path, rather than the place before."""
         near_m = SAME_PLACE * abs(self.offset_m) + math.hypot(last.sigma_m, pair.sigma_m)
-        return abs(residual_m(last, pair, self.heading)) < near_m
+        off_m = residual_m(last, pair, self.heading)
+        return abs(off_m) < min(near_m, abs(off_m + self.offset_m))
+
+    def leads_back(self, used: Iterable[FixPair], after: FixPair) -> bool:
+        """Whether most fixes used before it lie on the path that the jump, with its first fix, leads to.
+
+        Then it is the end of an error that came in unnoticed.
+        """
+        offs_m = [residual_m(one, after, self.heading) for one in used]
+        back = sum(abs(off_m) < abs(off_m - self.offset_m) for off_m in offs_m)
+        return 2 * back > len(offs_m)
 
 
 def exceeds_skid(before: list[FixPair], after: list[FixPair], heading: complex, scale: float) -> bool:

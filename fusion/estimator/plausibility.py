@@ -10,6 +10,7 @@ describe; until then, and for a while after, the covariance spans both places.
 import cmath
 import dataclasses
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -26,7 +27,7 @@ from terrafusion.fusion.estimator.dead_reckoning import (
     DeadReckoning,
     FixPair,
 )
-from terrafusion.fusion.estimator.fix_jump import SAME_PLACE, FixJump
+from terrafusion.fusion.estimator.fix_jump import SAME_PLACE, USED, FixJump
 from terrafusion.fusion.inputs.streams import WheelStream
 from terrafusion.fusion.inputs.validation import GnssFix
 
@@ -45,6 +46,8 @@ DOUBT, DOUBT_M = 0.35, 30.0
 JUMP_DOUBT, JUMP_DOUBT_M, HELD_S = 0.5, 100.0, 60.0
 """The same for fixes that jumped, and how long they are held off: their path says nothing of which place is
 right; a receiver corrects a wrong ambiguity within a minute, mostly (assumed)."""
+REMEMBERED_S = 90.0
+"""For which used fixes are remembered: a reflected signal is gone after half of it, mostly (assumed)."""
 SETTLED = 0.02
 """Share of the distance below which a jump is no longer in doubt."""
 REPEATED_SIGMA, REPEATED_M = 0.1, 0.005
@@ -160,7 +163,7 @@ class FixPlausibility:
     _refused_ns: int | None = None
     _doubt_m: complex = 0j
     _since: list[FixPair] = field(default_factory=list)
-    _used: list[FixPair] = field(default_factory=list)
+    _used: deque[FixPair] = field(default_factory=deque)
     _believed: bool = False
     _back: bool = False
     _fades: tuple[float, float] = (DOUBT, DOUBT_M)
@@ -240,10 +243,11 @@ class FixPlausibility:
 
     def _jumped(self, run: FixRun, heading: complex, scale: float, white: float) -> bool:
         """Test a run for a jump; True where it leads back to the place before the last one."""
-        run.jump = jump = FixJump.of(self._used, run.pairs, heading, scale, white)
+        run.jump = jump = FixJump.of(list(self._used)[-USED:], run.pairs, heading, scale, white)
         if jump is None:
             return False
-        if self.jump_m is not None and abs(jump.offset_m + self.jump_m) < SAME_PLACE * abs(self.jump_m):
+        undone = self.jump_m is not None and abs(jump.offset_m + self.jump_m) < SAME_PLACE * abs(self.jump_m)
+        if undone or (jump.impossible and jump.leads_back(self._used, run.pairs[0])):
             run.jump, self._back = None, True
             return True
         if jump.impossible:
@@ -271,7 +275,9 @@ class FixPlausibility:
         self.run, self._in_a_row, self._refused_ns = None, 0, None
         self._believed = self._back = False
         if not self._used or pair.t_ns > self._used[-1].t_ns:
-            self._used = [*self._used[-1:], pair]
+            self._used.append(pair)
+            while pair.t_ns - self._used[0].t_ns > REMEMBERED_S * 1e9 and len(self._used) > USED:
+                self._used.popleft()
 
     def watch(self, t_ns: int) -> None:
         """Forget a brief contradiction once no fix has come for a time."""
@@ -303,7 +309,7 @@ class FixPlausibility:
                 "the position was moved to them; its sigma spanned both places for a while"
             )
         if self.returns:
-            out.append(f"{self.returns} times the position went back to where it had been before such a move")
+            out.append(f"{times(self.returns)} the position went back to where most fixes before had it")
         if self.skids:
             out.append(
                 f"{times(self.skids)} fixes jumped to one side and stayed there: a skid between two fixes, "

@@ -79,3 +79,21 @@ def test_coarse_fixes_that_jump_further_than_wheels_can_skid_are_no_skid() -> No
     assert jump([0, 0, 2.8j, 2.8j], 1.0, 1.4, 1.2, 0.4) is None
     assert jump([0, 0, 6j, 6j], 1.0, 1.4, 1.2, 1.0) is None  # all of the sigma is white
     assert jump([0, 0, 6j, 6j], 1.0, 3.0, 1.2, 0.4) is None  # a faster robot may have skidded there
+
+
+def test_a_fix_that_is_nearer_to_the_place_before_does_not_continue_a_jump() -> None:
+    both = pairs([TURN * (1.4 * i + off) for i, off in enumerate([0, 0, 6j, 6j, 5j, 2.5j])], 1.0, 1.4, 1.2)
+    found = FixJump.of(both[:2], both[2:4], TURN, 1.0, 0.4)
+    assert found is not None
+    assert found.continued(both[3], both[4])
+    assert not found.continued(both[3], both[5])
+
+
+def test_a_jump_leads_back_where_most_fixes_before_lay() -> None:
+    offs = [0.0] * 30 + [0.5 * i * 1j for i in range(12)] + [6j] * 15
+    both = pairs([TURN * (1.4 * i + off) for i, off in enumerate([*offs, 0.0, 0.0])], 1.0, 1.4, 1.2)
+    found = FixJump.of(both[-4:-2], both[-2:], TURN, 1.0, 0.4)
+    assert found is not None
+    assert found.impossible
+    assert found.leads_back(both[:-2], both[-2])
+    assert not found.leads_back(both[40:-2], both[-2])
