@@ -65,9 +65,9 @@ class StartSearch:
         if self.known is not None:
             return self.known.at(self.level)
         now_ns = imu.t_ns[-1]
+        wait_s = self._config.start_without_gnss_s if self._config.inputs.gnss else 0.0
         # Fixes of another time, as of a receiver whose clock is wrong, are as none: they show no motion.
         if not any(begin <= fix.t_ns <= now_ns + JUMP_NS for fix in self._gnss.waiting):
-            wait_s = self._config.start_without_gnss_s if self._config.inputs.gnss else 0.0
             if not last and (now_ns - begin) * 1e-9 <= wait_s:
                 return None
             self._gnss.local = True
@@ -79,7 +79,7 @@ class StartSearch:
         if not last and silent_ns <= SILENT_NS:
             return None
         start = self._by_rough_heading(wheels, self.level)
-        if start is None and not last and silent_ns * 1e-9 > self._config.longest_wait_s:
+        if start is None and not last and silent_ns * 1e-9 > wait_s:
             return self._without_heading(self.level)
         if start is None:
             self._drop_unusable(imu, wheels)
