@@ -193,12 +193,17 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
 
 def _static_frames(container: BagContainer, notes: list[str]) -> StaticFrames:
     """Where the sensors of a robot are, as far as the bag tells; the catalogue knows its own bags."""
-    frames = StaticFrames()
-    if any((source.topic, source.msgtype) == STATIC and source.count for source in container.sources):
+    frames, (plain, msgtype) = StaticFrames(), STATIC
+    there = {s.topic for s in container.sources if s.count and s.msgtype == msgtype}
+    named = sorted(topic for topic in there if topic.endswith(plain))  # of a namespace: /robot/tf_static
+    chosen = [plain] if plain in there else named
+    if len(chosen) > 1:
+        notes.append(f"{', '.join(chosen)} are not used: several robots may name their frames alike")
+    elif chosen:
         try:
-            frames.add(read_streams(container, {STATIC: ()})[STATIC])
+            frames.add(read_streams(container, {(chosen[0], msgtype): ()})[chosen[0], msgtype])
         except BagError as error:
-            notes.append(f"{STATIC[0]} is not used: {str(error)[:MOST_TEXT]}")
+            notes.append(f"{chosen[0]} is not used: {str(error)[:MOST_TEXT]}")
     return frames
 
 

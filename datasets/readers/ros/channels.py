@@ -111,7 +111,7 @@ class ChannelBuilder:
 
     def mounting(self, frame: str) -> Mounting | None:
         """Where a sensor with a frame of its own is, and how it is turned, by the bag's fixed frames."""
-        return None if frame in ("", BASE) else self.frames.mounting(BASE, frame)
+        return None if frame.rpartition("/")[2] in ("", BASE) else self.frames.mounting(BASE, frame)
 
     def _held(self, name: str, topic: str, held: Mask) -> Mask:
         if not held.all():

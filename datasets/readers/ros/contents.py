@@ -61,6 +61,6 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         chosen_topics(container, Request(path, topics=topics), open_to_the_user)
     times_ns = {topic.name: np.sort(streams[topic.name, topic.msgtype].receipt_ns) for topic in usable}
     held = {name: t_ns for name, t_ns in times_ns.items() if len(t_ns)}  # an index may count too many
-    others = [topic for topic in there if topic not in usable and topic.name != STATIC[0]]
+    others = [topic for topic in there if topic not in usable and not topic.name.endswith(STATIC[0])]
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in others)
     return BagContents(held, unused, candidates)
