@@ -36,6 +36,7 @@ from terrafusion.datasets.readers.ros.streams import (
     Key,
     Stream,
     broken_bag_on_error,
+    has_fix,
     read_streams,
     twists,
     wanted_fields,
@@ -275,7 +276,7 @@ def _one_sensor(
 def _holds_data(stream: Stream) -> bool:
     """Whether a sensor's messages hold anything: a fix, or a number that is not zero."""
     if stream.msgtype == FIX:
-        return bool((stream.column("status.status") >= 0).any())
+        return bool(has_fix(stream.column("status.status")).any())
     if stream.msgtype == IMU:
         values = np.hstack([stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")])
     elif stream.msgtype == ODOMETRY:

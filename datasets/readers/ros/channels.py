@@ -44,7 +44,15 @@ from terrafusion.datasets.readers.ros.static_frames import (
     mounting_note,
     tells_turn,
 )
-from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.readers.ros.streams import (
+    ACKERMANN_AT,
+    UNKNOWN_VARIANCE,
+    UNSET_STATUS,
+    Stream,
+    has_fix,
+    poses,
+    twists,
+)
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.timed_tables import new_times
 
@@ -53,6 +61,8 @@ NAVSATFIX = ("latitude", "longitude", "altitude")
 MOVING_MPS = 0.05
 LEAST_APART = 3
 """Messages of each wheel between which those of wheels apart are interpolated."""
+MOST_WITHOUT_NUMBER = 0.01
+"""Share of an IMU's messages that glitches of its driver may take; more is a fault of the log."""
 SIDEWAYS_SHARE = 0.5
 """Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
 
@@ -84,16 +94,22 @@ class ChannelBuilder:
         return Command(t_ns, twist[:, 0], twist[:, 5])
 
     def imu(self, stream: Stream, t_ns: TimesNs) -> Imu:
-        """Rates and specific forces in body axes; rotated only where the frame is the rig's."""
+        """Rates and specific forces in body axes; first messages may lack numbers, and a few later ones."""
         gyro, accel = stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")
         gyro[stream.column("angular_velocity_covariance.0") == -1] = np.nan
         accel[stream.column("linear_acceleration_covariance.0") == -1] = np.nan
+        held = np.ones(len(stream), dtype=bool)
         for what, values in (("angular velocity", gyro), ("linear acceleration", accel)):
             known = ~np.isnan(values).all(axis=0)
             if not known.any():
                 self.notes.append(f"imu: {stream.topic} has no {what}")
-            self._refuse_nan(values[:, known], t_ns, stream.topic, what)
-        return Imu(t_ns, *self._to_body("imu", stream, gyro, accel))
+            finite = np.asarray(np.isfinite(values[:, known]).all(axis=1))
+            begin = int(np.argmax(finite))
+            if not finite[begin:].mean() >= 1.0 - MOST_WITHOUT_NUMBER:
+                self._refuse_nan(values[begin:, known], t_ns[begin:], stream.topic, what)
+            held &= finite
+        held = self._held("imu", stream.topic, held)
+        return Imu(t_ns[held], *(values[held] for values in self._to_body("imu", stream, gyro, accel)))
 
     def barometer(self, stream: Stream, t_ns: TimesNs) -> Barometer | None:
         """Pressures; messages without a number are left out."""
@@ -311,10 +327,15 @@ class ChannelBuilder:
     def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
         """Fixes as ENU about `datum`, or about the first valid fix."""
         status = stream.column("status.status")
-        fix = np.where(status >= 0, Fix.SINGLE, Fix.NONE).astype(np.uint8)
+        llh, unset = self._llh(stream), status == UNSET_STATUS
+        fix = np.where(has_fix(status), Fix.SINGLE, Fix.NONE).astype(np.uint8)
+        if unset.any():
+            fix[unset & (llh[:, :2] == 0.0).all(axis=1)] = Fix.NONE
+            count = f"{int(unset.sum())} of {len(unset)} fixes"
+            self.notes.append(f"gnss: {stream.topic} leaves the status of {count} unset; taken as single")
         for number, fix_class in FIX_OF_CODE["navsatfix"].items():
             fix[status == number] = fix_class
-        fixes = Fixes(t_ns, self._llh(stream), fix, self._sigma(stream))
+        fixes = Fixes(t_ns, llh, fix, self._sigma(stream))
         rows = f"messages of {stream.topic}"
         gnss, datum, notes = gnss_channel(self.rig, fixes, datum, rows=rows, channel=stream.topic)
         self.notes += notes
