@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.decimals import DAY_NS
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import assumed_sigma
@@ -38,7 +39,6 @@ UNIX_STAMP = re.compile(r"(?<![\d.])(\d{10}(?:\.\d+)?)(?![\d.])")
 ISO_STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?")
 
 KNOT_MPS = 1852.0 / 3600.0
-DAY_NS = 86400 * 10**9
 FIX_OF_QUALITY = FIX_OF_CODE["nmea"]
 NO_FIX = (6, 7, 8)
 """Qualities of GGA: estimated, manual, simulated."""
