@@ -50,6 +50,7 @@ from terrafusion.datasets.readers.ros.topics import (
     BagTopic,
     choose_topics,
     joints_given,
+    unread_receivers,
     wheel_advice,
 )
 
@@ -143,6 +144,8 @@ def _recording(container: BagContainer, request: Request) -> Recording:
     if "wheels" not in chosen:
         taken = [topic.name for kind, topic in chosen.items() if kind not in ("command", "steering")]
         notes.append(wheel_advice(topics_of(container), taken, functools.partial(_joints, container)))
+    if "gnss" not in chosen:
+        notes += unread_receivers(topics_of(container))
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
     start_ns = min(int(t[0]) for t in timing.times.values())

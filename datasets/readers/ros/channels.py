@@ -180,10 +180,16 @@ class ChannelBuilder:
         if stream.msgtype == topics.JOINTS:
             return self._wheels_of_joints(stream, t_ns), None
         if stream.msgtype in ACKERMANN_AT:
+            self._note_command("wheels", stream)
             speed = stream.column(f"{ACKERMANN_AT[stream.msgtype]}speed").astype(float)[:, None]
             self._refuse_nan(speed, t_ns, stream.topic, "speed")
             return Wheels(t_ns, speed, ("speed",), "mps"), None
         twist, variance = twists(stream)
+        begin = int(np.argmax(np.isfinite(twist[:, 0])))
+        if begin:
+            self.notes.append(f"wheels: {stream.topic}: the first {begin} messages hold no number; left out")
+            stream, t_ns = stream.select(np.arange(begin, len(t_ns))), t_ns[begin:]
+            twist, variance = twist[begin:], variance[begin:]
         v, rate = twist[:, 0], twist[:, 5]
         self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
         if stream.msgtype == topics.TWIST:
@@ -214,6 +220,10 @@ class ChannelBuilder:
             )
         half = rate * (track / 2.0)
         return Wheels(t_ns, np.stack([v - half, v + half], axis=1), ("left", "right"), "mps"), assumed
+
+    def _note_command(self, name: str, stream: Stream) -> None:
+        kind = stream.msgtype.rpartition("/")[2]
+        self.notes.append(f"{name}: {stream.topic} is an {kind}, to ROS a command; it is taken as measured")
 
     def _says_no_yaw(self, stream: Stream, rate: Array, variance: Array, v: Array, imu: Imu | None) -> bool:
         why = ""
@@ -302,6 +312,7 @@ class ChannelBuilder:
     def steering(self, stream: Stream, t_ns: TimesNs) -> Steering | None:
         """Steering angles, of joints or of an AckermannDrive."""
         if stream.msgtype in ACKERMANN_AT:
+            self._note_command("steering", stream)
             angle = stream.column(f"{ACKERMANN_AT[stream.msgtype]}steering_angle").astype(float)[:, None]
             self._refuse_nan(angle, t_ns, stream.topic, "steering angle")
             return Steering(t_ns, angle, ("angle",))
