@@ -53,7 +53,7 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         candidates[kind] = tuple(topic.name for topic in found)
         return found[0]
 
-    openers = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
+    openers = {"ros1": (ros1.open_container, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
     with opened_bag(path, *openers[form]) as container:
         there = topics_of(container)
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
