@@ -155,7 +155,8 @@ def _choice_notes(
     if taken is not None and left:
         yield f"{kind}: took {taken.name} ({taken.count} messages), left {', '.join(left)}"
     elif taken is None and kind in ("wheels", "gnss"):
-        fused = [t.name for t in found if looks_fused(kind, t)]
+        possible = (t for t in found if kind != "wheels" or not _GNSS_VELOCITY.search(t.name))
+        fused = [t.name for t in possible if looks_fused(kind, t)]
         if fused:
             yield (
                 f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "

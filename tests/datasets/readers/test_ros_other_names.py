@@ -89,6 +89,18 @@ def test_steering_of_a_bag_without_definitions(tmp_path: Path) -> None:
     assert "an AckermannDriveStamped, to ROS a command; it is taken as measured" in " ".join(recording.notes)
 
 
+def test_the_velocity_of_a_receiver_is_not_offered_for_wheels(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/TwistStamped"
+    twist = MAKE2.new("geometry_msgs/msg/Twist", MAKE2.vector(1.0, 0, 0), MAKE2.vector(0, 0, 0))
+    velocities = [("/gps/vel", kind, t, MAKE2.new(kind, MAKE2.header(t, "gps"), twist)) for t in TIMES]
+    fixes = [("/gps/fix", "sensor_msgs/msg/NavSatFix", t, MAKE2.fix(t, 48.0, 11.0)) for t in TIMES]
+    bag = write_ros2(tmp_path / "bag", sorted([*velocities, *fixes], key=lambda one: one[2]))
+    recording = open_recording(bag)
+    assert recording.gnss is not None
+    assert recording.gnss.velocity_enu_mps is not None
+    assert not any("wheels=/gps/vel" in note for note in recording.notes)
+
+
 def test_a_commanded_drive_is_no_wheel_speed(tmp_path: Path) -> None:
     """F1TENTH cars are commanded by /drive."""
     ROS2.register(get_types_from_msg(DEFINITIONS[ACKERMANN_STAMPED], ACKERMANN_STAMPED))
