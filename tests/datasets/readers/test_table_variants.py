@@ -31,6 +31,16 @@ def test_missing_values_between_blanks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(imu.accel_mps2[:, 0], [2.0, 2.0, np.nan])
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_header_that_comes_again_is_left_out(end: str, tmp_path: Path) -> None:
+    """Loggers that begin anew write it again; Excel is told the separator in front of it."""
+    lines = ["sep=;", "t;gz", "0,0;1", "t;gz", "t;gz", "1,0;1,5", "2,0;2", ""]
+    recording = open_recording(table(tmp_path, end.join(lines), "imu: {gyro_z_radps: gz}"))
+    assert recording.imu is not None
+    assert recording.imu.gyro_radps[:, 2].tolist() == [1.0, 1.5, 2.0]
+    assert any("the header comes 2 more times" in note for note in recording.notes)
+
+
 def test_another_encoding_is_named(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes("t,gz,heading (°)\n0,1,2\n".encode("latin-1"))
