@@ -131,7 +131,7 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         raise DataError(
             f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
             file=path,
-            remedy=f"give {kinds}",
+            remedy=f"export it as a table (.csv) or a bag; what can be read: {kinds}",
         )
     return found
 

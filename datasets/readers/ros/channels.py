@@ -379,10 +379,11 @@ class ChannelBuilder:
         close = np.abs(t_ns[nearest] - gnss.t_ns) <= min(interval / 2, 5e7)
         velocity = np.where(close[:, None], twist[nearest, :3], np.nan)
         velocity[:, 2][variance[nearest, 2] >= UNKNOWN_VARIANCE] = np.nan
+        without = int(np.isnan(velocity[:, :2]).any(axis=1).sum())
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.where(variance[nearest, 0] > 0, variance[nearest, 0], np.nan))
         self.notes.append(
-            f"gnss: velocity of {stream.topic} taken as east, north, up; {int((~close).sum())} fixes without"
+            f"gnss: velocity of {stream.topic} taken as east, north, up; {without} fixes without"
         )
         if np.isnan(velocity).all():
             return gnss

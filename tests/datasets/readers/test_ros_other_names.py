@@ -91,14 +91,17 @@ def test_steering_of_a_bag_without_definitions(tmp_path: Path) -> None:
 
 def test_the_velocity_of_a_receiver_is_not_offered_for_wheels(tmp_path: Path) -> None:
     kind = "geometry_msgs/msg/TwistStamped"
-    twist = MAKE2.new("geometry_msgs/msg/Twist", MAKE2.vector(1.0, 0, 0), MAKE2.vector(0, 0, 0))
-    velocities = [("/gps/vel", kind, t, MAKE2.new(kind, MAKE2.header(t, "gps"), twist)) for t in TIMES]
+    v = [np.nan, *[1.0] * (len(TIMES) - 1)]
+    twists = [MAKE2.new("geometry_msgs/msg/Twist", MAKE2.vector(e, 0, 0), MAKE2.vector(0, 0, 0)) for e in v]
+    made = [MAKE2.new(kind, MAKE2.header(t, "gps"), m) for t, m in zip(TIMES, twists, strict=True)]
+    velocities = [("/gps/vel", kind, t, m) for t, m in zip(TIMES, made, strict=True)]
     fixes = [("/gps/fix", "sensor_msgs/msg/NavSatFix", t, MAKE2.fix(t, 48.0, 11.0)) for t in TIMES]
     bag = write_ros2(tmp_path / "bag", sorted([*velocities, *fixes], key=lambda one: one[2]))
     recording = open_recording(bag)
     assert recording.gnss is not None
     assert recording.gnss.velocity_enu_mps is not None
     assert not any("wheels=/gps/vel" in note for note in recording.notes)
+    assert any("/gps/vel taken as east, north, up; 1 fixes without" in note for note in recording.notes)
 
 
 def test_a_commanded_drive_is_no_wheel_speed(tmp_path: Path) -> None:
