@@ -44,6 +44,8 @@ from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 
 SHOWN_COLUMNS = 60
+MOST_AT_ONCE = 50
+"""So many rows of one time, and no other, are no log."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -117,7 +119,7 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
         raise DataError("holds no rows", remedy="record or copy it again")
-    if len(t_ns) > 1 and not np.ptp(t_ns):
+    if len(t_ns) > MOST_AT_ONCE and not np.ptp(t_ns):
         what = f"all {len(t_ns)} rows have the same time by column '{column_map.time.column}'"
         raise DataError(what, remedy=f"map 'time' to another column: the file has {_few(columns.names)}")
     start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
