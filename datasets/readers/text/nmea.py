@@ -169,8 +169,11 @@ def collect(text: str) -> tuple[list[Epoch], list[str]]:
     epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", remedy="record GGA or RMC")
-    # RMC repeats the position of a GGA with fewer digits
-    return [epoch for epoch in epochs if epoch.from_gga] or epochs, notes
+    # RMC repeats the position of a GGA with fewer digits, without height and quality.
+    full = [epoch for epoch in epochs if epoch.from_gga]
+    if without := sum(epoch.fix != Fix.NONE and not epoch.from_gga for epoch in epochs) if full else 0:
+        notes.append(f"gnss: {without} of {len(epochs)} epochs have an RMC and no GGA; left out")
+    return full or epochs, notes
 
 
 def _gga(log: _Log, f: list[str]) -> Epoch:
