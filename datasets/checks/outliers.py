@@ -181,7 +181,7 @@ def _check_duration(context: CheckContext, name: str, t_ns: TimesNs) -> Iterator
             "impossible-time", "error", name,
             f"its times span {days:.0f} days",
             f"longest interval {leap_s:.3g} s after t = {context.since_start_s(t_ns[row]):.3f} s",
-            "is the unit of time right? split the log where the clock jumps",
+            "is the unit of time right? have the clock repaired (--repair-clock), or split the log there",
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Exact conversion of decimal and ISO 8601 times to integer nanoseconds."""
 
+import re
 from collections.abc import Sequence
 from decimal import ROUND_HALF_EVEN, Decimal
 
@@ -12,6 +13,10 @@ NS_PER = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MAX_CHARACTERS = 40
 _LIMIT_NS = 2**63 - 1
 FIRST_YEAR, LAST_YEAR = 1900, 2200
+DAY_NS = 86_400 * 10**9
+OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
+"""A time of day alone."""
+_DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?!\d)")
 
 
 class NotADecimal(ValueError):  # noqa: N818
@@ -84,3 +89,11 @@ def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
     if bad.size:
         raise NotADecimal(int(bad[0]))
     return np.asarray(stamps.dt.as_unit("ns").astype("int64").to_numpy())
+
+
+def iso_dates(texts: Sequence[str]) -> list[str]:
+    """Dates and times without blanks around, also from 3.9.2020 12:00:00,5: with points the day is first."""
+    return [
+        _DAY_FIRST.sub(lambda d: f"{d[3]}-{d[2]:0>2}-{d[1]:0>2}", text.strip(), count=1).replace(",", ".")
+        for text in texts
+    ]

@@ -78,7 +78,7 @@ class Format:
 _READERS = "terrafusion.datasets.readers"
 FORMATS: tuple[Format, ...] = (
     Format("comma_segment", "a segment of comma2k19 (its folder)", f"{_READERS}.sets.comma_segment"),
-    Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros.ros1"),
+    Format("ros1", "a ROS 1 .bag (or the folder of its parts)", f"{_READERS}.ros.ros1"),
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros.ros2"),
     Format("table_folder", "a folder of tables with column maps", f"{_READERS}.text.table_folder"),
     Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
@@ -131,7 +131,7 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         raise DataError(
             f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
             file=path,
-            remedy=f"give {kinds}",
+            remedy=f"export it as a table (.csv) or a bag; what can be read: {kinds}",
         )
     return found
 

@@ -62,6 +62,8 @@ def _as_one(logs: Sequence[str]) -> str:
         return ""
     if all(name.endswith((".mcap", ".db3")) for name in logs):
         return "; if they are one bag, `ros2 bag reindex` writes its metadata.yaml"
+    if all(name.endswith(".bag") for name in logs):
+        return "; parts of one drive have names that end in _0.bag, _1.bag, ..."
     return "; for one drive, write a column map beside each table (Plain tables in docs/reference/formats.md)"
 
 

@@ -183,6 +183,9 @@ class GnssUpdater:
                 used |= self._add_fix(chain, k, fix, noise)
                 if self._within_reach:
                     self._unchecked = fix
+        if self.velocities.undo_wrong(chain, noise, self._bias_sigma):
+            self.skid.restart()
+            used = True
         self.fix_noise.drift.fresh = used and self._share >= LEAST_SHARE
         if used:
             self.weighting.revisit(chain)
@@ -200,6 +203,7 @@ class GnssUpdater:
         """What the newest fix shows of the noise of fixes, and of friction."""
         if self._pair is not None:
             self.track.keep(self._pair)
+            self.velocities.test(self._pair, fix, self.fix_noise.scale)
         self.fix_noise.learn(self.track.scatter(), self.track.white_share())
         if self.fix_noise.scale > OPTIMISTIC_SCATTER * self._applied_scale:
             self._doubt_used(chain, fix)

@@ -63,6 +63,11 @@ def _on_fixes(gnss: GnssUpdater) -> list[str]:
     notes += gnss.plausible.notes()
     if gnss.velocities.refused:
         notes.append(f"{gnss.velocities.refused} GNSS velocities were far from what wheels and IMU allow")
+    if left_out := gnss.velocities.test_of_path.left_out:
+        notes.append(
+            f"{counted(left_out, 'GNSS velocity', 'GNSS velocities')} left out: not the rate of the "
+            "positions, which wheels fit; check their axes (east, north, up), signs and unit (m/s)"
+        )
     if gnss.skid.refutations:
         notes.append(f"fixes showed {times(gnss.skid.refutations)} that the wheels skidded")
     friction = gnss.skid.friction

@@ -110,6 +110,15 @@ class Chain:
         for node in self._changed(k):
             node.velocities.append(velocity)
 
+    def drop_velocities(self, since_ns: int) -> None:
+        """Drop the GNSS velocities of all keyframes from a time on."""
+        begin = bisect.bisect_left(self.nodes, since_ns, key=lambda node: node.t_ns)
+        for node in self.nodes[begin:]:
+            node.velocities.clear()
+        self._dirty = min(self._dirty, self.first + begin)
+        if self.archive is not None:
+            self.archive.drop_velocities(since_ns)
+
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         """Replace a GNSS position of keyframe k by one of another weight."""
         for node in self._changed(k):

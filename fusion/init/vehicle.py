@@ -45,6 +45,8 @@ COMMENTS = {
     "imu_yaw_rad": "rad; angle of the IMU about z, to the left",
 }
 """Of every number that `calibrate_sensors` may find."""
+FOLLOWED = "gnss-velocity"
+"""A warning of numbers that the estimator follows, wrong as they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +206,7 @@ def _mounted(
         if not any(finding.imu_axes for finding in found):  # the reader of the log turns by the file
             recording, rig, findings, axes = turned, turned_rig, found, lines
     repaired: list[Finding] = []
-    if any(finding.severity == "error" for finding in findings):
+    if any(finding.severity == "error" or finding.code == FOLLOWED for finding in findings):
         recording, repaired = repair(recording, rig)
         findings = run_checks(recording, rig)
     for finding in findings:

@@ -36,6 +36,7 @@ from terrafusion.datasets.readers.ros.streams import (
     Key,
     Stream,
     broken_bag_on_error,
+    has_fix,
     read_streams,
     twists,
     wanted_fields,
@@ -49,6 +50,7 @@ from terrafusion.datasets.readers.ros.topics import (
     BagTopic,
     choose_topics,
     joints_given,
+    unread_receivers,
     wheel_advice,
 )
 
@@ -142,6 +144,8 @@ def _recording(container: BagContainer, request: Request) -> Recording:
     if "wheels" not in chosen:
         taken = [topic.name for kind, topic in chosen.items() if kind not in ("command", "steering")]
         notes.append(wheel_advice(topics_of(container), taken, functools.partial(_joints, container)))
+    if "gnss" not in chosen:
+        notes += unread_receivers(topics_of(container))
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
     start_ns = min(int(t[0]) for t in timing.times.values())
@@ -193,12 +197,17 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
 
 def _static_frames(container: BagContainer, notes: list[str]) -> StaticFrames:
     """Where the sensors of a robot are, as far as the bag tells; the catalogue knows its own bags."""
-    frames = StaticFrames()
-    if any((source.topic, source.msgtype) == STATIC and source.count for source in container.sources):
+    frames, (plain, msgtype) = StaticFrames(), STATIC
+    there = {s.topic for s in container.sources if s.count and s.msgtype == msgtype}
+    named = sorted(topic for topic in there if topic.endswith(plain))  # of a namespace: /robot/tf_static
+    chosen = [plain] if plain in there else named
+    if len(chosen) > 1:
+        notes.append(f"{', '.join(chosen)} are not used: several robots may name their frames alike")
+    elif chosen:
         try:
-            frames.add(read_streams(container, {STATIC: ()})[STATIC])
+            frames.add(read_streams(container, {(chosen[0], msgtype): ()})[chosen[0], msgtype])
         except BagError as error:
-            notes.append(f"{STATIC[0]} is not used: {str(error)[:MOST_TEXT]}")
+            notes.append(f"{chosen[0]} is not used: {str(error)[:MOST_TEXT]}")
     return frames
 
 
@@ -270,7 +279,7 @@ def _one_sensor(
 def _holds_data(stream: Stream) -> bool:
     """Whether a sensor's messages hold anything: a fix, or a number that is not zero."""
     if stream.msgtype == FIX:
-        return bool((stream.column("status.status") >= 0).any())
+        return bool(has_fix(stream.column("status.status")).any())
     if stream.msgtype == IMU:
         values = np.hstack([stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")])
     elif stream.msgtype == ODOMETRY:

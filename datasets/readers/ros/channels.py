@@ -44,7 +44,15 @@ from terrafusion.datasets.readers.ros.static_frames import (
     mounting_note,
     tells_turn,
 )
-from terrafusion.datasets.readers.ros.streams import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.readers.ros.streams import (
+    ACKERMANN_AT,
+    UNKNOWN_VARIANCE,
+    UNSET_STATUS,
+    Stream,
+    has_fix,
+    poses,
+    twists,
+)
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.timed_tables import new_times
 
@@ -53,6 +61,8 @@ NAVSATFIX = ("latitude", "longitude", "altitude")
 MOVING_MPS = 0.05
 LEAST_APART = 3
 """Messages of each wheel between which those of wheels apart are interpolated."""
+MOST_WITHOUT_NUMBER = 0.01
+"""Share of an IMU's messages that glitches of its driver may take; more is a fault of the log."""
 SIDEWAYS_SHARE = 0.5
 """Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
 
@@ -84,16 +94,22 @@ class ChannelBuilder:
         return Command(t_ns, twist[:, 0], twist[:, 5])
 
     def imu(self, stream: Stream, t_ns: TimesNs) -> Imu:
-        """Rates and specific forces in body axes; rotated only where the frame is the rig's."""
+        """Rates and specific forces in body axes; first messages may lack numbers, and a few later ones."""
         gyro, accel = stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")
         gyro[stream.column("angular_velocity_covariance.0") == -1] = np.nan
         accel[stream.column("linear_acceleration_covariance.0") == -1] = np.nan
+        held = np.ones(len(stream), dtype=bool)
         for what, values in (("angular velocity", gyro), ("linear acceleration", accel)):
             known = ~np.isnan(values).all(axis=0)
             if not known.any():
                 self.notes.append(f"imu: {stream.topic} has no {what}")
-            self._refuse_nan(values[:, known], t_ns, stream.topic, what)
-        return Imu(t_ns, *self._to_body("imu", stream, gyro, accel))
+            finite = np.asarray(np.isfinite(values[:, known]).all(axis=1))
+            begin = int(np.argmax(finite))
+            if not finite[begin:].mean() >= 1.0 - MOST_WITHOUT_NUMBER:
+                self._refuse_nan(values[begin:, known], t_ns[begin:], stream.topic, what)
+            held &= finite
+        held = self._held("imu", stream.topic, held)
+        return Imu(t_ns[held], *(values[held] for values in self._to_body("imu", stream, gyro, accel)))
 
     def barometer(self, stream: Stream, t_ns: TimesNs) -> Barometer | None:
         """Pressures; messages without a number are left out."""
@@ -111,7 +127,7 @@ class ChannelBuilder:
 
     def mounting(self, frame: str) -> Mounting | None:
         """Where a sensor with a frame of its own is, and how it is turned, by the bag's fixed frames."""
-        return None if frame in ("", BASE) else self.frames.mounting(BASE, frame)
+        return None if frame.rpartition("/")[2] in ("", BASE) else self.frames.mounting(BASE, frame)
 
     def _held(self, name: str, topic: str, held: Mask) -> Mask:
         if not held.all():
@@ -164,10 +180,16 @@ class ChannelBuilder:
         if stream.msgtype == topics.JOINTS:
             return self._wheels_of_joints(stream, t_ns), None
         if stream.msgtype in ACKERMANN_AT:
+            self._note_command("wheels", stream)
             speed = stream.column(f"{ACKERMANN_AT[stream.msgtype]}speed").astype(float)[:, None]
             self._refuse_nan(speed, t_ns, stream.topic, "speed")
             return Wheels(t_ns, speed, ("speed",), "mps"), None
         twist, variance = twists(stream)
+        begin = int(np.argmax(np.isfinite(twist[:, 0])))
+        if begin:
+            self.notes.append(f"wheels: {stream.topic}: the first {begin} messages hold no number; left out")
+            stream, t_ns = stream.select(np.arange(begin, len(t_ns))), t_ns[begin:]
+            twist, variance = twist[begin:], variance[begin:]
         v, rate = twist[:, 0], twist[:, 5]
         self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
         if stream.msgtype == topics.TWIST:
@@ -198,6 +220,10 @@ class ChannelBuilder:
             )
         half = rate * (track / 2.0)
         return Wheels(t_ns, np.stack([v - half, v + half], axis=1), ("left", "right"), "mps"), assumed
+
+    def _note_command(self, name: str, stream: Stream) -> None:
+        kind = stream.msgtype.rpartition("/")[2]
+        self.notes.append(f"{name}: {stream.topic} is an {kind}, to ROS a command; it is taken as measured")
 
     def _says_no_yaw(self, stream: Stream, rate: Array, variance: Array, v: Array, imu: Imu | None) -> bool:
         why = ""
@@ -286,6 +312,7 @@ class ChannelBuilder:
     def steering(self, stream: Stream, t_ns: TimesNs) -> Steering | None:
         """Steering angles, of joints or of an AckermannDrive."""
         if stream.msgtype in ACKERMANN_AT:
+            self._note_command("steering", stream)
             angle = stream.column(f"{ACKERMANN_AT[stream.msgtype]}steering_angle").astype(float)[:, None]
             self._refuse_nan(angle, t_ns, stream.topic, "steering angle")
             return Steering(t_ns, angle, ("angle",))
@@ -311,10 +338,15 @@ class ChannelBuilder:
     def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
         """Fixes as ENU about `datum`, or about the first valid fix."""
         status = stream.column("status.status")
-        fix = np.where(status >= 0, Fix.SINGLE, Fix.NONE).astype(np.uint8)
+        llh, unset = self._llh(stream), status == UNSET_STATUS
+        fix = np.where(has_fix(status), Fix.SINGLE, Fix.NONE).astype(np.uint8)
+        if unset.any():
+            fix[unset & (llh[:, :2] == 0.0).all(axis=1)] = Fix.NONE
+            count = f"{int(unset.sum())} of {len(unset)} fixes"
+            self.notes.append(f"gnss: {stream.topic} leaves the status of {count} unset; taken as single")
         for number, fix_class in FIX_OF_CODE["navsatfix"].items():
             fix[status == number] = fix_class
-        fixes = Fixes(t_ns, self._llh(stream), fix, self._sigma(stream))
+        fixes = Fixes(t_ns, llh, fix, self._sigma(stream))
         rows = f"messages of {stream.topic}"
         gnss, datum, notes = gnss_channel(self.rig, fixes, datum, rows=rows, channel=stream.topic)
         self.notes += notes
@@ -347,10 +379,11 @@ class ChannelBuilder:
         close = np.abs(t_ns[nearest] - gnss.t_ns) <= min(interval / 2, 5e7)
         velocity = np.where(close[:, None], twist[nearest, :3], np.nan)
         velocity[:, 2][variance[nearest, 2] >= UNKNOWN_VARIANCE] = np.nan
+        without = int(np.isnan(velocity[:, :2]).any(axis=1).sum())
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.where(variance[nearest, 0] > 0, variance[nearest, 0], np.nan))
         self.notes.append(
-            f"gnss: velocity of {stream.topic} taken as east, north, up; {int((~close).sum())} fixes without"
+            f"gnss: velocity of {stream.topic} taken as east, north, up; {without} fixes without"
         )
         if np.isnan(velocity).all():
             return gnss

@@ -53,7 +53,7 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         candidates[kind] = tuple(topic.name for topic in found)
         return found[0]
 
-    openers = {"ros1": (ros1.Ros1File, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
+    openers = {"ros1": (ros1.open_container, ros1.REMEDY), "ros2": (ros2.open_container, ros2.REMEDY)}
     with opened_bag(path, *openers[form]) as container:
         there = topics_of(container)
         usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
@@ -61,6 +61,6 @@ def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagConten
         chosen_topics(container, Request(path, topics=topics), open_to_the_user)
     times_ns = {topic.name: np.sort(streams[topic.name, topic.msgtype].receipt_ns) for topic in usable}
     held = {name: t_ns for name, t_ns in times_ns.items() if len(t_ns)}  # an index may count too many
-    others = [topic for topic in there if topic not in usable and topic.name != STATIC[0]]
+    others = [topic for topic in there if topic not in usable and not topic.name.endswith(STATIC[0])]
     unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in others)
     return BagContents(held, unused, candidates)

@@ -4,6 +4,7 @@ A container (in `ros1`, `mcap_file`, `ros2`) lists its `BagSource`s and yields `
 of a chunk and the places of one source's messages in it. No message becomes a Python object.
 """
 
+import dataclasses
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -93,6 +94,35 @@ class BagContainer(Protocol):
 
     def close(self) -> None:
         """Give the file back."""
+
+
+class JoinedFiles:
+    """Files of one bag, one after the other, as one container."""
+
+    def __init__(self) -> None:
+        self._files: list[tuple[BagContainer, dict[int, int]]] = []  # and the ids here by those of the file
+        self.sources: list[BagSource] = []
+        self.cut = ""
+
+    def add(self, file: BagContainer) -> None:
+        """Take the next file; it is closed with this container."""
+        ids = {source.id: len(self.sources) + k for k, source in enumerate(file.sources)}
+        self.sources += [dataclasses.replace(source, id=ids[source.id]) for source in file.sources]
+        self._files.append((file, ids))
+        self.cut = file.cut or self.cut
+
+    def close(self) -> None:
+        """Give the files back."""
+        for file, _ in self._files:
+            file.close()
+
+    def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
+        """The messages of the wanted groups of sources, file by file."""
+        for file, ids in self._files:
+            mine = [[own for own, number in ids.items() if number in group] for group in wanted]
+            here = [group for group, own in enumerate(mine) if own]
+            for batch in file.batches([mine[group] for group in here]) if here else ():
+                yield batch._replace(group=here[batch.group])
 
 
 def grouped(numbers: NDArray[Any], wanted: Groups) -> Iterator[tuple[int, Places]]:

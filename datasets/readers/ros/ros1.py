@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.formats import MAP_SUFFIX, Request
 from terrafusion.datasets.readers.ros.bag import opened_bag, recording_of
 from terrafusion.datasets.readers.ros.raw import (
+    BagContainer,
     BagError,
     BagSource,
     Bytes,
     Groups,
+    JoinedFiles,
     MessageBatch,
     decompress,
     normal_type,
@@ -37,17 +40,67 @@ PLACE = np.dtype([("sec", "<u4"), ("nanosec", "<u4"), ("at", "<u4")])
 """Entry of an index: receipt time of a message, and where its record begins in the chunk."""
 _length = struct.Struct("<I").unpack_from
 REMEDY = "copy it again, or mend it with `rosbag reindex`"
+PARTS_OVERLAP_S, PARTS_APART_S = 1.0, 60.0
+"""A part of a bag begins at most so long before and after the one before it ends: others are other drives."""
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether `path` is named like a ROS 1 bag, or begins as one."""
+    """Whether `path` is named like a ROS 1 bag, or begins as one, or is a folder of the parts of one."""
+    if path.is_dir():
+        described = (path / "meta.yaml").is_file() or any(path.glob(f"*{MAP_SUFFIX}"))
+        return not described and len(_parts(path)) > 1
     return path.is_file() and (path.suffix == ".bag" or head.startswith(b"#ROSBAG V2.0"))
 
 
 def read(request: Request) -> list[Recording]:
     """The one recording of a ROS 1 bag."""
-    with opened_bag(request.path, Ros1File, REMEDY) as container:
-        return [recording_of(container, request)]
+    with opened_bag(request.path, open_container, REMEDY) as container:
+        recording = recording_of(container, request)
+    if not request.path.is_dir():
+        return [recording]
+    return [recording.with_notes(f"read as one: {', '.join(p.name for p in _parts(request.path))}")]
+
+
+def open_container(path: Path) -> BagContainer:
+    """The container of a bag, or of the parts of one; BagError where it is broken."""
+    return Ros1Folder(path) if path.is_dir() else Ros1File(path)
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The bags of a folder where their names end in _0, _1, ..., as `rosbag record --split` numbers them."""
+    bags = [path for path in folder.iterdir() if path.suffix == ".bag" and path.is_file()]
+    numbers = {path: path.stem.rpartition("_")[2] for path in bags}
+    if not all(number.isdecimal() for number in numbers.values()):
+        return []
+    parts = sorted(bags, key=lambda path: int(numbers[path]))
+    first = int(numbers[parts[0]]) if parts else 0
+    return parts if [int(numbers[path]) for path in parts] == [*range(first, first + len(parts))] else []
+
+
+class Ros1Folder(JoinedFiles):
+    """An open bag that was split into numbered parts.
+
+    Raises:
+        BagError: a part breaks the format.
+        DataError: one does not begin where the one before it ends.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        end_ns, before = None, ""
+        try:
+            for path in _parts(folder):
+                part = Ros1File(path)
+                self.add(part)
+                first_ns, last_ns = part.span_ns()
+                gap_s = (first_ns - (first_ns if end_ns is None else end_ns)) * 1e-9
+                if not -PARTS_OVERLAP_S <= gap_s <= PARTS_APART_S:
+                    what = f"begins {gap_s:.3f} s after {before} ends: they are no parts of one recording"
+                    raise DataError(what, file=path, remedy="give one of them itself")
+                end_ns, before = last_ns, path.name
+        except BaseException:
+            self.close()
+            raise
 
 
 class _Chunk(NamedTuple):
@@ -183,6 +236,14 @@ class Ros1File:
             raise BagError(f"the file ends at {self._end} of {position + size} bytes")
         self._file.seek(position)
         return self._file.read(size)
+
+    def span_ns(self) -> tuple[int, int]:
+        """Receipt times of the first and the last message; a BagError without any."""
+        places = [p for chunk in self._chunks for p in chunk.places.values() if len(p)]
+        if not places:
+            raise BagError("a part holds no message")
+        times = [p["sec"].astype(np.int64) * 10**9 + p["nanosec"] for p in places]
+        return min(int(t.min()) for t in times), max(int(t.max()) for t in times)
 
     def _source(self, number: int) -> BagSource:
         fields, details = self._connections[number]

@@ -4,7 +4,6 @@ A recorder that was killed writes no `metadata.yaml`: its files are named after 
 """
 
 import contextlib
-import dataclasses
 import os
 import shutil
 import sqlite3
@@ -30,6 +29,7 @@ from terrafusion.datasets.readers.ros.raw import (
     BagError,
     BagSource,
     Groups,
+    JoinedFiles,
     MessageBatch,
     batches_of,
     decompress,
@@ -202,7 +202,7 @@ def open_container(path: Path) -> BagContainer:
     return McapFile(path) if path.suffix == ".mcap" else Db3File(path)
 
 
-class Ros2Folder:
+class Ros2Folder(JoinedFiles):
     """An open ROS 2 bag of one or several files, one after the other.
 
     Raises:
@@ -210,9 +210,8 @@ class Ros2Folder:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._files: list[tuple[BagContainer, dict[int, int]]] = []  # and the ids here by those of the file
+        super().__init__()
         self._scratch = ExitStack()
-        self.sources: list[BagSource] = []
         self.cut = "" if (folder / METADATA).is_file() else "its recorder did not close it"
         metadata = _metadata(folder)
         storage = STORAGES.get(str(metadata.get("storage_identifier")))
@@ -231,21 +230,15 @@ class Ros2Folder:
                 if not path.is_file():
                     raise BagError(f"the file {path.name} is missing")
                 path = self._unpacked(path) if mode == "file" else path
-                self._add(storage(path))
+                self.add(storage(path))
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        for file, _ in self._files:
-            file.close()
+        """Give the files back, and remove unpacked ones."""
+        super().close()
         self._scratch.close()
-
-    def _add(self, file: BagContainer) -> None:
-        ids = {source.id: len(self.sources) + k for k, source in enumerate(file.sources)}
-        self.sources += [dataclasses.replace(source, id=ids[source.id]) for source in file.sources]
-        self._files.append((file, ids))
-        self.cut = file.cut or self.cut
 
     def _unpacked(self, path: Path) -> Path:
         """A file without its zstd compression, in a scratch folder."""
@@ -258,12 +251,8 @@ class Ros2Folder:
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources, file by file."""
-        for file, ids in self._files:
-            mine = [[own for own, number in ids.items() if number in group] for group in wanted]
-            here = [group for group, own in enumerate(mine) if own]
-            for batch in file.batches([mine[group] for group in here]) if here else ():
-                found = batch._replace(group=here[batch.group])
-                yield _unpacked_messages(found) if self._packed else found
+        for batch in super().batches(wanted):
+            yield _unpacked_messages(batch) if self._packed else batch
 
 
 def _unpacked_messages(batch: MessageBatch) -> MessageBatch:

@@ -50,20 +50,33 @@ class StaticFrames:
     def mounting(self, base: str, frame: str) -> Mounting | None:
         """Position (m) of a frame in the base's axes, and rotation (3, 3) from its axes to the base's.
 
-        None where no chain of transforms leads from one to the other.
+        The base may have the frame's prefix: r1/base_link for r1/imu. None where no transforms connect them.
         """
         base, frame = _plain(base), _plain(frame)
+        known = {frame, *self._parents, *(parent for parent, _, _ in self._parents.values())}
+        if base not in known:
+            base = f"{frame.rpartition('/')[0]}/{base}"
+        from_base, from_frame = self._up_from(base), self._up_from(frame)
+        common = next((name for name in from_frame if name in from_base), None)
+        if common is None:
+            return None
+        (at, R), (base_at, base_R) = from_frame[common], from_base[common]
+        position, R = base_R.T @ (at - base_at), base_R.T @ R
+        exact = np.rint(R)
+        x, y, z = position.tolist()
+        return (x, y, z), exact if np.abs(R - exact).max() < RIGHT_ANGLE else R
+
+    def _up_from(self, frame: str) -> dict[str, tuple[Array, Array]]:
+        """Position and rotation of a frame in its own axes and those of all frames above it."""
         position, R = np.zeros(3), np.eye(3)
-        for _ in range(len(self._parents) + 1):
-            if frame == base:
-                exact = np.rint(R)
-                x, y, z = position.tolist()
-                return (x, y, z), exact if np.abs(R - exact).max() < RIGHT_ANGLE else R
-            if frame not in self._parents:
-                return None
+        found = {frame: (position, R)}
+        while frame in self._parents:
             frame, translation, turn = self._parents[frame]
+            if frame in found:  # a circle
+                break
             position, R = translation + turn @ position, turn @ R
-        return None
+            found[frame] = position, R
+        return found
 
 
 def tells_turn(mounting: Mounting, frame: str, rig: Rig | None) -> bool:

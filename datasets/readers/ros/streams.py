@@ -19,6 +19,8 @@ from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, BagSour
 
 UNKNOWN_VARIANCE = 1e6
 """By ROS custom, a variance this large marks an unknown quantity."""
+UNSET_STATUS = -2
+"""Of a NavSatFix whose driver does not set it, since ROS 2 Iron; -1 is no fix."""
 
 TWIST_AT = {
     topics.TWIST: ("", ""),
@@ -148,6 +150,11 @@ class Stream:
                 columns = {path: column[order] for path, column in block.columns.items()}
                 blocks.append(MessageBlock(new[block.rows[order]], columns))
         return Stream(self.topic, self.msgtype, self.receipt_ns[index], tuple(blocks))
+
+
+def has_fix(status: NDArray[Any]) -> NDArray[np.bool_]:
+    """Mask (N,) of the statuses of NavSatFix that do not say that there is none."""
+    return np.asarray((status >= 0) | (status == UNSET_STATUS))
 
 
 def twists(stream: Stream) -> tuple[Array, Array]:

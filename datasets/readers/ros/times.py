@@ -35,7 +35,7 @@ class StreamTimes:
 def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool) -> StreamTimes:
     """Times of every stream on one clock; the streams are in the order of the file.
 
-    Header stamps are used unless `stamps` is "receipt", or they are all zero, or the topics'
+    Header stamps are used unless `stamps` is "receipt", or they are all zero or the same, or the topics'
     header clocks do not agree. Messages without a header then take their receipt time, brought
     onto the header clock when the two clocks are more than a second apart.
 
@@ -99,17 +99,23 @@ def _only_delayed(stream: Stream) -> bool:
 def _headed(timing: StreamTimes, stamps: str) -> Times:
     """Header stamps of the streams that have some, unless receipt stamps are asked for."""
     found = {kind: t for kind, s in timing.streams.items() if (t := s.header_ns) is not None}
-    headed = {kind: t for kind, t in found.items() if t.any()}
+    headed = {kind: t for kind, t in found.items() if t.any() and not _stand_still(t)}
     if stamps == "receipt":
         late = _latencies(timing, headed, {kind: timing.streams[kind].receipt_ns for kind in headed})
         timing.notes.append("times are receipt stamps, as asked" + (f"; {late}" if late else ""))
         return {}
     for kind in (kind for kind in found if kind not in headed):
         topic = timing.streams[kind].topic
-        timing.notes.append(f"{topic}: header stamps are all zero; receipt stamps are used")
+        value = "the same" if found[kind].any() else "zero"
+        timing.notes.append(f"{topic}: header stamps are all {value}; receipt stamps are used")
     if not found:
         timing.notes.append("times are receipt stamps: no message has a header")
     return headed
+
+
+def _stand_still(header_ns: TimesNs) -> bool:
+    """Whether a driver set its stamps once and for all; two messages of one time are a message sent again."""
+    return len(header_ns) > 2 and not np.ptp(header_ns)
 
 
 def _on_one_clock(

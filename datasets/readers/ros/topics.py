@@ -64,6 +64,9 @@ _FUSED = re.compile(
     re.IGNORECASE,
 )
 _COMMAND = re.compile(r"cmd|command", re.IGNORECASE)
+_DRIVE = re.compile(r"(^|[/_])(drive|teleop)$", re.IGNORECASE)
+"""Usual names of a commanded AckermannDrive."""
+_RECEIVER = re.compile(r"gps|gnss|navsat|nav_?pvt|ublox|novatel|septentrio", re.IGNORECASE)
 _WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|odom|joint_states", re.IGNORECASE)
 _GNSS_VELOCITY = re.compile(r"(fix|gps|gnss|navsat).*vel|vel.*(fix|gps|gnss|navsat)", re.IGNORECASE)
 _TERRAIN = re.compile(r"terrain|ground_class|surface", re.IGNORECASE)
@@ -152,7 +155,8 @@ def _choice_notes(
     if taken is not None and left:
         yield f"{kind}: took {taken.name} ({taken.count} messages), left {', '.join(left)}"
     elif taken is None and kind in ("wheels", "gnss"):
-        fused = [t.name for t in found if looks_fused(kind, t)]
+        possible = (t for t in found if kind != "wheels" or not _GNSS_VELOCITY.search(t.name))
+        fused = [t.name for t in possible if looks_fused(kind, t)]
         if fused:
             yield (
                 f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "
@@ -222,7 +226,7 @@ def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool
     if topic.msgtype == JOINTS:
         return not _COMMAND.search(name) and has_joints(name)
     if topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED):  # mostly a command, which is no measurement
-        return not _COMMAND.search(name)
+        return not _COMMAND.search(name) and not (kind == "wheels" and _DRIVE.search(name))
     if topic.msgtype == TWIST:  # mostly a command, and without a time: only on request
         return False
     if topic.msgtype in (TWIST_STAMPED, TWIST_COVARIANCE):
@@ -234,6 +238,17 @@ def _rank(kind: str, topic: BagTopic) -> tuple[int, bool, bool, int, str]:
     order = TYPES[kind].index(topic.msgtype)
     unpreferred = kind == "wheels" and not _PREFERRED_WHEEL.search(topic.name)
     return order, unpreferred, bool(_RAW.search(topic.name)), -topic.count, topic.name
+
+
+def unread_receivers(bag: Sequence[BagTopic]) -> list[str]:
+    """A note for a bag without fixes, on its topics that may hold some in a type that is not read."""
+    strange = (t for t in bag if not any(t.msgtype in types for types in TYPES.values()))
+    others = [
+        t for t in strange if _RECEIVER.search(f"{t.name} {t.msgtype}") and not _NEVER.search(t.msgtype)
+    ]
+    shown = ", ".join(f"{t.name} ({t.msgtype})" for t in others[:MOST_SHOWN])
+    what = f"gnss: not used are {shown}, of types that are not read; record the fixes as {FIX}"
+    return [f"{what}, or give them as a table"] if others else []
 
 
 def wheel_advice(

@@ -121,7 +121,8 @@ class MappedColumn:
 class TimeColumn:
     """The time column: decimal numbers in `unit` since `epoch`, or ISO 8601.
 
-    `epoch` is unix, gps (leap seconds are taken off), none (no calendar), or an instant in ISO 8601.
+    `epoch` is unix, gps (leap seconds are taken off), none (no calendar), or an instant in ISO 8601, also of
+    the day that times of day are of.
     `nanoseconds` is the column with the rest below a second, where the times are split, "" for none.
     """
 

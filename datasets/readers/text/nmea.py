@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.decimals import DAY_NS
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import assumed_sigma
@@ -38,7 +39,6 @@ UNIX_STAMP = re.compile(r"(?<![\d.])(\d{10}(?:\.\d+)?)(?![\d.])")
 ISO_STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?")
 
 KNOT_MPS = 1852.0 / 3600.0
-DAY_NS = 86400 * 10**9
 FIX_OF_QUALITY = FIX_OF_CODE["nmea"]
 NO_FIX = (6, 7, 8)
 """Qualities of GGA: estimated, manual, simulated."""
@@ -169,8 +169,11 @@ def collect(text: str) -> tuple[list[Epoch], list[str]]:
     epochs = [epoch for epoch in log.epochs if epoch.llh is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", remedy="record GGA or RMC")
-    # RMC repeats the position of a GGA with fewer digits
-    return [epoch for epoch in epochs if epoch.from_gga] or epochs, notes
+    # RMC repeats the position of a GGA with fewer digits, without height and quality.
+    full = [epoch for epoch in epochs if epoch.from_gga]
+    if without := sum(epoch.fix != Fix.NONE and not epoch.from_gga for epoch in epochs) if full else 0:
+        notes.append(f"gnss: {without} of {len(epochs)} epochs have an RMC and no GGA; left out")
+    return full or epochs, notes
 
 
 def _gga(log: _Log, f: list[str]) -> Epoch:

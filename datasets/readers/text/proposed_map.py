@@ -5,6 +5,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
+from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
 from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, VARIANCE, YAW_RATE, units_of
 
@@ -39,7 +43,14 @@ UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", 
 """Units as headers write them, in brackets or behind an underscore."""
 TIME_UNITS = ("s", "ms", "us", "ns")
 _BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
-_TIME = re.compile(r"(^|_)(time|timestamp|stamp|t|sec|secs|seconds|utc|epoch|date|datetime|zeit)(_|$)")
+_TIME = re.compile(
+    r"(^|_)([a-z]*time|timestamp|stamp|t|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
+)
+_WEEK = re.compile(r"(^|_)(g?wk|week|week_?n(r|o|um|umber)?|wn)$")
+_OF_WEEK = re.compile(r"(^|_)(i?tow|sow)(_|$)|of_week")
+"""Names of GPS weeks, and of the time within one."""
+_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu"}
+"""Channel that a column belongs to by the sensor in front of its name: gps_speed is none of the wheels."""
 
 _SIDES = {
     "left": "left|l",
@@ -121,20 +132,23 @@ _WHEELS = tuple(
 
 @dataclass(frozen=True)
 class _Header:
-    """A column's name, without its unit, in small letters with underscores; and the unit, "" for none."""
+    """A column's name, without its unit, in small letters with underscores; the unit, "" for none; and the
+    sensor in front of the name."""
 
     column: str
     base: str
     unit: str
+    sensor: str
 
 
 def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
     """A first column map, on one line, for the user to correct; the first row's cells tell units."""
     headers = [_header(name) for name in names]
-    times = [h for h in headers if _TIME.search(h.base)]
-    time = next((h for h in times if h.base == "header_stamp"), [*times, headers[0]][0])
-    rest = _nanoseconds(time.column, names)
     cells = dict(zip(names, first, strict=False))
+    times = [h for h in headers if _TIME.search(h.base)]
+    of_day = [h for h in times if _cell_of_day(h, cells)]
+    time = next((h for h in times if h.base == "header_stamp"), [*of_day, *times, headers[0]][0])
+    rest = _nanoseconds(time.column, names)
     channels: dict[str, dict[str, str]] = {}
     for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
         if header.column in (time.column, rest):
@@ -143,12 +157,12 @@ def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
             if field not in channels.get(channel, {}):
                 channels.setdefault(channel, {})[field] = _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
-    cell = cells.get(time.column, "")
     sections = ", ".join(
         f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
         for channel, fields in channels.items()
     )
-    return f"time: {_time_entry(time, cell, rest)}, channels: {{{sections}}}"
+    day = _day(headers, time, cells)
+    return f"time: {_time_entry(time, cells.get(time.column, ''), rest, day)}, channels: {{{sections}}}"
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
@@ -203,7 +217,8 @@ def _header(name: str) -> _Header:
         base = path[1]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
-    return _Header(name, re.sub(r"^(imu|gps|gnss|odom|robot)_(?=.)", "", base), known)
+    sensor = re.match(r"(imu|gps|gnss|odom|robot)_(?=.)", base)
+    return _Header(name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "")
 
 
 def _guess(header: _Header) -> tuple[str, str] | None:
@@ -213,7 +228,7 @@ def _guess(header: _Header) -> tuple[str, str] | None:
         if own and channel in ("imu", "wheels", "gnss", "motor", "steering"):
             return channel, header.column
     for pattern, channel, fields in _PATTERNS:
-        if not re.fullmatch(pattern, header.base):
+        if _OWNER.get(header.sensor, channel) != channel or not re.fullmatch(pattern, header.base):
             continue
         for field in fields:
             fits = not header.unit or header.unit in units_of(field)
@@ -269,14 +284,35 @@ def _nanoseconds(time: str, names: Sequence[str]) -> str:
     return next((name for name in pairs if name in names), "")
 
 
-def _time_entry(time: _Header, cell: str, rest: str) -> str:
+def _cell_of_day(header: _Header, cells: Mapping[str, str]) -> bool:
+    return OF_DAY.fullmatch(iso_dates([cells.get(header.column, "")])[0]) is not None
+
+
+def _day(headers: Sequence[_Header], time: _Header, cells: Mapping[str, str]) -> str:
+    """The day or GPS week of a time within it, by another column; "" where none tells."""
+    others = [(header, cells.get(header.column, "")) for header in headers if header is not time]
+    if _OF_WEEK.search(time.base):
+        weeks = [number_in(cell) for header, cell in others if _WEEK.search(header.base)]
+        full = [week for week in weeks if week is not None and FULL_WEEK_MIN <= week < 10 * FULL_WEEK_MIN]
+        starts = gps_to_unix_ns(np.array(full[:1], dtype=np.int64) * WEEK_S * 10**9)
+        return "".join(f"{np.datetime64(int(start), 'ns').astype('datetime64[s]')}Z" for start in starts)
+    dates = iso_dates([cell for header, cell in others if _TIME.search(header.base)])
+    known = [date for date in dates if re.fullmatch(r"\d{4}-\d\d-\d\d", date)]
+    return known[0] if known and _cell_of_day(time, cells) else ""
+
+
+def _time_entry(time: _Header, cell: str, rest: str, day: str) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
+    since = f", epoch: {json.dumps(day)}" if day else ""
     value = number_in(cell.replace(",", "."))
     if value is None and cell.strip():
-        return f"{{column: {name}, unit: iso8601}}"
+        return f"{{column: {name}, unit: iso8601{since}}}"
     if value is None:
         return f"{{column: {name}, unit: {unit or 's'}, epoch: unix}}"
+    if _OF_WEEK.search(time.base):
+        unit = unit or ("ms" if abs(value) > WEEK_S or time.base == "i_tow" else "s")
+        return f"{{column: {name}, unit: {unit}{since or ', epoch: none'}}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
     unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "s")
     if abs(value) < 0.1 * size[unit]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import TimesNs, distinct
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.conventions import apply
-from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
+from terrafusion.datasets.core.decimals import DAY_NS, OF_DAY, NotADecimal, dates_to_ns, iso_dates
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
@@ -24,12 +24,14 @@ from terrafusion.datasets.readers.delimited import head_lines, number_in, separa
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
+    EPOCHS,
     GEODETIC,
     TEXT_FIELDS,
     VARIANCE,
     YAW_RATE,
     ColumnMap,
     MappedColumn,
+    TimeColumn,
     contract_map,
     read_column_map,
     units_of,
@@ -42,6 +44,8 @@ from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 
 SHOWN_COLUMNS = 60
+MOST_AT_ONCE = 50
+"""So many rows of one time, and no other, are no log."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -82,10 +86,13 @@ def read(request: Request) -> list[Recording]:
         raise _mapless(path, columns.names, columns.first_cells())
     for name in column_map.columns():
         if name not in columns.names:
-            few = ", ".join(columns.names[:SHOWN_COLUMNS])
-            raise DataError(f"there is no column '{name}'", remedy=f"the file has {few}")
+            raise DataError(f"there is no column '{name}'", remedy=f"the file has {_few(columns.names)}")
     columns.read(column_map)
     return [_recording(request, columns, column_map, notes)]
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:SHOWN_COLUMNS])
 
 
 def _mapless(path: Path, names: list[str], first: list[str]) -> DataError:
@@ -112,6 +119,9 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
         raise DataError("holds no rows", remedy="record or copy it again")
+    if len(t_ns) > MOST_AT_ONCE and not np.ptp(t_ns):
+        what = f"all {len(t_ns)} rows have the same time by column '{column_map.time.column}'"
+        raise DataError(what, remedy=f"map 'time' to another column: the file has {_few(columns.names)}")
     start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
@@ -151,7 +161,7 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     time = column_map.time
     t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
     if t_ns is None:
-        return _iso_ns(columns, time.column)
+        return _iso_ns(columns, time)
     if time.nanoseconds:
         rest_ns = columns.times_ns(time.nanoseconds, "ns")
         if rest_ns is None or (np.abs(rest_ns) >= 10**9).any():
@@ -174,17 +184,28 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     return t_ns, []
 
 
-def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[str]]:
-    texts = columns.texts(name).tolist()
+def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64], list[str]]:
+    """Dates with times, or times of day: these begin on the day of the epoch, and go on after midnight."""
+    texts = columns.texts(time.column).tolist()
+    plain = iso_dates(texts)
+    of_day = bool(texts) and OF_DAY.fullmatch(plain[0]) is not None
     try:
-        t_ns = dates_to_ns(texts)
+        t_ns = dates_to_ns(
+            ["1970-01-01T" + "0" * (text[1:2] == ":") + text for text in plain] if of_day else plain
+        )
     except NotADecimal as bad:
         raise DataError(
-            f"column '{name}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
+            f"column '{time.column}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
             remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
         ) from None
-    zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", texts[0].strip())
-    return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
+    if not of_day:
+        zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", plain[0])
+        return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
+    steps = np.diff(t_ns, prepend=t_ns[:1])
+    t_ns = t_ns + DAY_NS * np.cumsum((steps < -DAY_NS // 2).astype(np.int64) - (steps > DAY_NS // 2))
+    if time.epoch in EPOCHS:
+        return t_ns, ["times of day are those of 1970-01-01; 'epoch' of the column map can give the day"]
+    return t_ns + dates_to_ns([time.epoch])[0], ["times without an offset are taken as UTC"]
 
 
 def _table(

@@ -13,6 +13,7 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
+    BOM,
     MISSING,
     TextLayout,
     head_lines,
@@ -27,6 +28,8 @@ from terrafusion.datasets.readers.text.column_map import ColumnMap
 COMMENT = "#"
 SAMPLE_ROWS = 200
 """Rows that tell a decimal comma."""
+_EXCEL = re.compile(r"sep=.", re.IGNORECASE)
+"""What may stand in front of a header for Excel."""
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
@@ -41,6 +44,7 @@ class TextColumns:
         self.path = path
         text = read_text(path)
         self._layout = _layout(text, column_map)
+        text, self._repeated = _headed_once(text, self._layout)
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -50,7 +54,9 @@ class TextColumns:
         texts = {*column_map.time.columns(), *column_map.words()}
         numbers = [name for name in column_map.columns() if name not in texts]
         self._table = read_columns(self.path, self._text, self._layout, numbers, sorted(texts))
+        again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
+        self.notes += [again] if self._repeated else []
 
     def first_cells(self) -> list[str]:
         """The cells of the first row; [] where there is none."""
@@ -83,7 +89,7 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     for at, line in head_lines(data):
         if line.startswith(COMMENT):
             comment = line.lstrip("# ")
-        elif line.strip():
+        elif line.strip() and not _EXCEL.fullmatch(line):
             header, number = line, at
             break
     if not header:
@@ -116,10 +122,26 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     cells = [cell for row in _sample(data, layout) for cell in row]
     if not any(map(_COMMA.fullmatch, cells)) or any(map(_POINT.fullmatch, cells)):
         return data, False
-    begin = 0
-    for _ in range(layout.first_line - 1):
-        begin = data.find(b"\n", begin) + 1
+    begin = _begin(data, layout.first_line)
     return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
+
+
+def _begin(data: bytes, line: int) -> int:
+    """Where a line, from 1, begins."""
+    begin = 0
+    for _ in range(line - 1):
+        begin = data.find(b"\n", begin) + 1
+    return begin
+
+
+def _headed_once(data: bytes, layout: TextLayout) -> tuple[bytes, int]:
+    """The text with blank lines for repetitions of its header, and their number."""
+    end = _begin(data, layout.first_line)
+    header = data[_begin(data, max(layout.first_line - 1, 1)) : end].strip(b"\r\n").removeprefix(BOM)
+    if split(header.decode("utf-8"), layout.separator) != list(layout.names) or data.find(header, end) < 0:
+        return data, 0
+    rows, count = re.subn(rb"(?<=\n)" + re.escape(header) + rb"\r?(?=\n)", b"", data[end - 1 :])
+    return (type(data)(data[: end - 1] + rows), count) if count else (data, 0)
 
 
 def _is_value(cell: str) -> bool:

@@ -223,6 +223,14 @@ def test_damaged_sentences_are_counted_and_left_out(tmp_path: Path) -> None:
     assert any("3 of 81 sentences are damaged" in note for note in recording.notes)
 
 
+def test_epochs_whose_gga_is_lost_are_counted(tmp_path: Path) -> None:
+    parts = [("" if k in (7, 9) else gga(k, p)) + rmc(k, p) for k, p in enumerate(llh_of())]
+    recording = open_recording(log(tmp_path, "".join(parts)))
+    assert recording.gnss is not None
+    assert len(recording.gnss) == N - 2
+    assert any("2 of 40 epochs have an RMC and no GGA; left out" in note for note in recording.notes)
+
+
 def test_mostly_damaged_is_refused(tmp_path: Path) -> None:
     parts = [gga(k, p) for k, p in enumerate(llh_of())]
     parts = [p if k % 3 == 0 else p.replace("12", "13") for k, p in enumerate(parts)]

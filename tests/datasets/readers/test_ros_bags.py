@@ -239,6 +239,31 @@ def test_fixes(tmp_path: Path, husky_rig: Rig) -> None:
     assert "2 of 5 messages of /fix hold no fix" in notes_of(recording)
 
 
+def test_a_status_that_no_driver_sets_is_no_lack_of_a_fix(tmp_path: Path) -> None:
+    """STATUS_UNKNOWN, -2, is the default of NavSatFix since ROS 2 Iron."""
+    places = [(48.0, 11.0), (0.0, 0.0), (48.001, 11.0)]
+    fixes = [MAKE2.fix(T0 + i * 10**9, *place, status=-2) for i, place in enumerate(places)]
+    messages = [("/fix", "sensor_msgs/msg/NavSatFix", T0 + i * 10**9, m) for i, m in enumerate(fixes)]
+    recording = open_recording(write_ros2(tmp_path / "bag", messages))
+    assert recording.gnss is not None
+    assert recording.gnss.fix.tolist() == [Fix.SINGLE, Fix.SINGLE]
+    assert "/fix leaves the status of 3 of 3 fixes unset; taken as single" in notes_of(recording)
+
+
+def test_messages_of_an_imu_without_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
+    """Until the hardware answers, and seldom later; more of them are refused (`test_bad_bag`)."""
+    messages = imu_messages(MAKE2, n=200, gyro=(0.0, 0.0, 0.5))
+    for i in (0, 1, 90):
+        messages[i][3].angular_velocity.z = np.nan
+    messages[120][3].linear_acceleration_covariance[0] = -1.0
+    recording = open_recording(write_ros2(tmp_path / "bag", messages))
+    assert recording.imu is not None
+    assert recording.imu.t_ns.tolist() == [T0 + i * 10**7 for i in range(200) if i not in (0, 1, 90, 120)]
+    assert set(recording.imu.gyro_radps[:, 2]) == {0.5}
+    assert np.isfinite(recording.imu.accel_mps2).all()
+    assert "imu: 4 of 200 messages of /imu/data hold no number; left out" in notes_of(recording)
+
+
 @pytest.mark.parametrize(
     ("status", "sigma_m"), [(0, (3.0, 3.0, 6.0)), (1, (1.0, 1.0, 2.0)), (2, (0.02, 0.02, 0.04))]
 )

@@ -22,7 +22,7 @@ from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, decompr
 from terrafusion.datasets.readers.ros.ros1 import Ros1File
 from terrafusion.datasets.readers.ros.ros2 import open_container
 from terrafusion.datasets.readers.ros.streams import read_streams
-from tests.datasets.ros_bags import MAKE1, write_ros1
+from tests.datasets.ros_bags import MAKE1, imu_messages, write_ros1
 from tests.datasets.ros_bits import ROS1, ROS2, T0, assert_same, imu, serialized
 
 MIX = (("/imu", "sensor_msgs/msg/Imu", 5), ("/js", "sensor_msgs/msg/JointState", 20),
@@ -288,3 +288,30 @@ def test_messages_that_are_all_laid_out_differently(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag", messages)
     with pytest.raises(DataError, match=r"a\.bag, /joints: .*more than 100 \(in.*; leave the topic out"):
         open_recording(path)
+
+
+def parts_of_a_bag(folder: Path, begins: list[int], names: list[str]) -> Path:
+    """Bags of 20 IMU messages, 10 ms apart, that begin at these messages."""
+    folder.mkdir()
+    for begin, name in zip(begins, names, strict=True):
+        messages = [(topic, kind, t + begin * 10**7, m) for topic, kind, t, m in imu_messages(MAKE1)]
+        for _, _, t, message in messages:
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(t, 10**9)
+        write_ros1(folder / name, messages)
+    return folder
+
+
+def test_the_parts_of_a_split_ros1_bag_are_one(tmp_path: Path) -> None:
+    """`rosbag record --split` numbers them; a prefix is followed by the time of each."""
+    names = [f"run_2024-05-01-12-0{i // 5}-00_{i}.bag" for i in range(8, 12)]
+    recording = open_recording(parts_of_a_bag(tmp_path / "run", [0, 20, 40, 60], names))
+    assert recording.imu is not None
+    assert (recording.imu.t_ns - recording.start_ns).tolist() == [i * 10**7 for i in range(80)]
+    assert f"read as one: {', '.join(names)}" in recording.notes
+
+
+@pytest.mark.parametrize("begin", [0, 10_000])
+def test_numbered_bags_of_other_drives_are_not_joined(tmp_path: Path, begin: int) -> None:
+    folder = parts_of_a_bag(tmp_path / "runs", [200, begin], ["run_1.bag", "run_2.bag"])
+    with pytest.raises(DataError, match=r"run_2.bag: begins .* s after run_1.bag ends: .* give one of them"):
+        open_recording(folder)

@@ -84,7 +84,54 @@ def test_steering_of_a_bag_without_definitions(tmp_path: Path) -> None:
     connection.execute("DROP TABLE message_definitions")
     connection.commit()
     connection.close()
-    assert open_recording(bag).steering is not None
+    recording = open_recording(bag)
+    assert recording.steering is not None
+    assert "an AckermannDriveStamped, to ROS a command; it is taken as measured" in " ".join(recording.notes)
+
+
+def test_the_velocity_of_a_receiver_is_not_offered_for_wheels(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/TwistStamped"
+    v = [np.nan, *[1.0] * (len(TIMES) - 1)]
+    twists = [MAKE2.new("geometry_msgs/msg/Twist", MAKE2.vector(e, 0, 0), MAKE2.vector(0, 0, 0)) for e in v]
+    made = [MAKE2.new(kind, MAKE2.header(t, "gps"), m) for t, m in zip(TIMES, twists, strict=True)]
+    velocities = [("/gps/vel", kind, t, m) for t, m in zip(TIMES, made, strict=True)]
+    fixes = [("/gps/fix", "sensor_msgs/msg/NavSatFix", t, MAKE2.fix(t, 48.0, 11.0)) for t in TIMES]
+    bag = write_ros2(tmp_path / "bag", sorted([*velocities, *fixes], key=lambda one: one[2]))
+    recording = open_recording(bag)
+    assert recording.gnss is not None
+    assert recording.gnss.velocity_enu_mps is not None
+    assert not any("wheels=/gps/vel" in note for note in recording.notes)
+    assert any("/gps/vel taken as east, north, up; 1 fixes without" in note for note in recording.notes)
+
+
+def test_a_commanded_drive_is_no_wheel_speed(tmp_path: Path) -> None:
+    """F1TENTH cars are commanded by /drive."""
+    ROS2.register(get_types_from_msg(DEFINITIONS[ACKERMANN_STAMPED], ACKERMANN_STAMPED))
+    drive = ROS2.types["ackermann_msgs/msg/AckermannDrive"](0.1, 0.0, 1.0, 0.0, 0.0)
+    stamped = ROS2.types[ACKERMANN_STAMPED]
+    messages = [("/drive", ACKERMANN_STAMPED, t, stamped(MAKE2.header(t, ""), drive)) for t in TIMES]
+    bag = write_ros2(tmp_path / "bag", [*imu_messages(MAKE2, n=5), *messages])
+    unasked = open_recording(bag)
+    assert unasked.wheels is None
+    assert "--topic wheels=/drive" in " ".join(unasked.notes)
+    assert open_recording(bag, topics={"wheels": "/drive"}).wheels is not None
+
+
+def test_odometry_without_numbers_until_the_hardware_answers_is_left_out(tmp_path: Path) -> None:
+    messages = odometry_messages(MAKE2)
+    for *_, message in messages[:3]:
+        message.twist.twist.linear.x = message.twist.twist.angular.z = np.nan
+    recording = open_recording(write_ros2(tmp_path / "bag", messages))
+    assert recording.wheels is not None
+    assert recording.wheels.t_ns.tolist() == [t for _, _, t, _ in messages[3:]]
+    assert any("/odom: the first 3 messages hold no number" in note for note in recording.notes)
+
+
+def test_fixes_of_a_type_that_is_not_read_are_named(tmp_path: Path) -> None:
+    fixes = ("/gps/pvt", "std_msgs/msg/Float64", T0, MAKE2.new("std_msgs/msg/Float64", 1.0))
+    bag = write_ros2(tmp_path / "bag", [*imu_messages(MAKE2, n=5), fixes])
+    noted = " ".join(open_recording(bag).notes)
+    assert "gnss: not used are /gps/pvt (std_msgs/msg/Float64), of types that are not read" in noted
 
 
 @pytest.mark.parametrize(

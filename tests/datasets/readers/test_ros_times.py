@@ -219,3 +219,10 @@ def test_a_simulated_clock_may_start_at_zero(tmp_path: Path) -> None:
     recording = open_recording(write_ros1(tmp_path / "a.bag", messages))
     assert recording.imu is not None
     assert recording.imu.t_ns.tolist() == [k * 10 * MS for k in range(100)]
+
+
+def test_stamps_that_stand_still_give_way_to_those_of_receipt(tmp_path: Path) -> None:
+    recording = open_recording(drive(tmp_path, rate=0.0))
+    for name, t_ns in true_times(late_ns=3 * MS).items():
+        np.testing.assert_array_equal(times(recording)[name], t_ns)
+    assert "/imu: header stamps are all the same; receipt stamps are used" in recording.notes

@@ -263,6 +263,33 @@ def test_without_the_base_frame_nothing_changes(tmp_path: Path) -> None:
     assert not any("/tf_static" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize("base", ["siblings", "sensor above", "prefix", "namespace"])
+def test_fixed_frames_are_followed_wherever_the_base_is_in_their_tree(tmp_path: Path, base: str) -> None:
+    """An IMU upside down, an antenna over two frames."""
+    over, box, mast = (1.0, 0.0, 0.0, 0.0), ((0.1, 0.0, 0.25), (1.0, 0.0, 0.0, 0.0)), (-0.1, 0.0, 0.4)
+    pre = "r1/" if base == "prefix" else ""
+    root = f"{pre}base_footprint" if base == "siblings" else f"{pre}base_link"
+    tree = [transform(root, f"{pre}mast", mast), transform(f"{pre}mast", f"{pre}gps", (0.0, 0.0, 0.2))]
+    if base == "siblings":
+        tree += [transform(root, "base_link", (0.0, 0.0, 0.15))]
+    if base == "sensor above":
+        tree += [transform("imu_box", "base_link", (-0.1, 0.0, 0.25), over)]
+    else:
+        tree += [transform(root, f"{pre}imu_box", *box)]
+    topic = "/r1/tf_static" if base == "namespace" else "/tf_static"
+    imu = imu_messages(MAKE2, frame=f"{pre}imu_box", gyro=(0.3, 0.2, 0.5), accel=(1.0, 2.0, -9.81))
+    fixes = [("/fix", "sensor_msgs/msg/NavSatFix", T0 + k, MAKE2.fix(T0 + k, 48.0, 11.0)) for k in range(3)]
+    for *_, fix in fixes:
+        fix.header.frame_id = f"{pre}gps"
+    bag = [(topic, TF, T0, MAKE2.new(TF, tree)), *imu, *fixes]
+    recording = open_recording(write_ros2(tmp_path / "bag", sorted(bag, key=lambda one: one[2])))
+    assert recording.imu is not None
+    np.testing.assert_allclose(recording.imu.accel_mps2[0], (1.0, -2.0, 9.81))
+    up = 0.15 if base == "siblings" else 0.0
+    assert recording.overrides.imu_m == pytest.approx((0.1, 0.0, 0.25 - up))
+    assert recording.overrides.antenna_m == pytest.approx((-0.1, 0.0, 0.6 - up))
+
+
 def test_a_turn_of_any_angle_keeps_missing_axes_missing() -> None:
     c, s = np.cos(0.3), np.sin(0.3)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

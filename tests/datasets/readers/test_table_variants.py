@@ -31,6 +31,16 @@ def test_missing_values_between_blanks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(imu.accel_mps2[:, 0], [2.0, 2.0, np.nan])
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_header_that_comes_again_is_left_out(end: str, tmp_path: Path) -> None:
+    """Loggers that begin anew write it again; Excel is told the separator in front of it."""
+    lines = ["sep=;", "t;gz", "0,0;1", "t;gz", "t;gz", "1,0;1,5", "2,0;2", ""]
+    recording = open_recording(table(tmp_path, end.join(lines), "imu: {gyro_z_radps: gz}"))
+    assert recording.imu is not None
+    assert recording.imu.gyro_radps[:, 2].tolist() == [1.0, 1.5, 2.0]
+    assert any("the header comes 2 more times" in note for note in recording.notes)
+
+
 def test_another_encoding_is_named(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes("t,gz,heading (°)\n0,1,2\n".encode("latin-1"))
@@ -117,6 +127,48 @@ def test_exports_of_ros_messages_are_proposed(kind: str, tmp_path: Path) -> None
     assert recording.imu is not None
     assert recording.imu.t_ns.tolist() == [t_ns]
     assert recording.imu.gyro_radps[0, 2] == rate
+
+
+MIDNIGHT_NS = 1_600_041_600 * 10**9
+"""2020-09-14, in GPS week 2123 at 86418 s."""
+CLOCKS = {
+    "date and time of day": ("Date,Time", "2020-09-13,23:59:59.75", "2020-09-14,00:00:00.25"),
+    "with points and commas": ("Datum;Uhrzeit", "13.9.2020;23:59:59,75", "14.9.2020;0:00:00,25"),
+    "day first": ("id;time", "7;13.09.2020 23:59:59,75", "8;14.09.2020 00:00:00,25"),
+    "GPS week and seconds": ("GPS Week,TOW [s]", "2123,86417.75", "2123,86418.25"),
+    "GPS week and milliseconds": ("week,iTOW", "2123,86417750", "2123,86418250"),
+}
+
+
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_times_in_two_columns_or_of_a_day_are_proposed(kind: str, tmp_path: Path) -> None:
+    separator = ";" if ";" in CLOCKS[kind][0] else ","
+    ends = ("gyro_z", "0.5", "0.25") if separator == "," else ("gyro_z", "0,5", "0,25")
+    text = "".join(f"{line}{separator}{end}\n" for line, end in zip(CLOCKS[kind], ends, strict=True))
+    imu = opened_as_proposed(tmp_path, text).imu
+    assert imu is not None
+    assert imu.t_ns.tolist() == [MIDNIGHT_NS - 250_000_000, MIDNIGHT_NS + 250_000_000]
+    assert imu.gyro_radps[:, 2].tolist() == [0.5, 0.25]
+
+
+def test_a_column_that_gives_all_rows_one_time_is_refused(tmp_path: Path) -> None:
+    path = table(tmp_path, "t,day,gyro_z\n" + "2020-09-13,5,1\n" * 60)
+    path.with_name("log.csv.columns.yaml").write_text(
+        "time: {column: t, unit: iso8601}\nchannels: {imu: {gyro_z_radps: gyro_z}}\n", encoding="utf-8"
+    )
+    with pytest.raises(
+        DataError, match=r"all 60 rows have the same time by column 't'; map 'time' to another"
+    ):
+        open_recording(path)
+
+
+def test_the_speed_of_a_receiver_is_not_proposed_as_that_of_wheels(tmp_path: Path) -> None:
+    text = "t,gps_speed,speed,gps_lat,gps_lon,imu_yaw,x,y\n0,9,1,48,11,0,1,2\n1,9,1,48,11,0,1,2\n"
+    recording = opened_as_proposed(tmp_path, text)
+    assert recording.wheels is not None
+    assert recording.wheels.speed.tolist() == [[1.0], [1.0]]
+    assert recording.truth is not None
+    assert recording.truth.quaternion is None
 
 
 @pytest.mark.parametrize("end", ["0", "_0", "[0]"])

@@ -133,6 +133,22 @@ def test_the_effective_track_is_that_of_the_radius_found(drive: Recording, tmp_p
     assert factors[0] == pytest.approx(factors[1], rel=0.02)
 
 
+def test_velocities_of_another_frame_are_repaired_by_a_command(
+    drive: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A warning only, but the estimator would follow them."""
+    monkeypatch.setattr("terrafusion.fusion.init.vehicle._calibrated", lambda *args: (None, ()))
+    gnss = drive.gnss
+    assert gnss is not None
+    assert gnss.velocity_enu_mps is not None
+    swapped = dataclasses.replace(gnss, velocity_enu_mps=gnss.velocity_enu_mps[:, [1, 0, 2]])
+    log = write_log_folder(dataclasses.replace(drive, gnss=swapped), tmp_path / "log")
+    done = run(log, "--out", tmp_path / "own.yaml", "--no-verdict")
+    assert done.exit_code == 0, done.exception
+    assert "velocities have east and north swapped" in done.output
+    assert f"\nnext: terrafusion convert {log} log_fixed --apply-fixes" in done.output
+
+
 def test_a_wrong_mounting_in_a_log_folder_is_repaired_by_a_command(drive: Recording, tmp_path: Path) -> None:
     log = write_log_folder(sensor_frame(drive, HUSKY), tmp_path / "log")
     out = tmp_path / "own.yaml"

@@ -1,8 +1,9 @@
-"""Velocities of fixes: of unknown sigma, without an upward part, of the wrong shape."""
+"""Velocities of fixes: of unknown sigma, without an upward part, of the wrong shape, in another frame."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_VELOCITY_SIGMA_MPS
 from terrafusion.fusion.api.replays import replay
-from terrafusion.fusion.inputs.validation import checked_fix
+from terrafusion.fusion.estimator.dead_reckoning import FixPair
+from terrafusion.fusion.estimator.velocity_test import VelocityTest
+from terrafusion.fusion.inputs.validation import GnssFix, checked_fix
 from tests.fusion.estimator.test_gnss import winding
 
 
@@ -55,3 +58,63 @@ def test_a_velocity_of_two_axes_and_an_endless_sigma_are_refused() -> None:
         checked_fix(0, np.zeros(3), np.full(3, 0.1), np.zeros(2), 0.1, None)
     with pytest.raises(DataError, match="sigma"):
         checked_fix(0, np.zeros(3), np.array([np.inf, np.inf, 1.0]), None, np.nan, None)
+
+
+FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "swapped": lambda v: v[:, [1, 0, 2]],
+    "reversed": lambda v: -v,
+    "zero": lambda v: 0.0 * v,
+    "knots": lambda v: 1.944 * v,
+}
+
+
+@pytest.mark.parametrize(("fault", "batch"), [*((name, False) for name in FAULTS), ("reversed", True)])
+def test_velocities_that_are_not_the_rate_of_the_positions_are_left_out(
+    drive: Recording, fault: str, batch: bool
+) -> None:
+    gnss, truth = drive.gnss, drive.truth
+    assert gnss is not None
+    assert gnss.velocity_enu_mps is not None
+    assert truth is not None
+    wrong = dataclasses.replace(gnss, velocity_enu_mps=FAULTS[fault](gnss.velocity_enu_mps))
+    run = dataclasses.replace(drive, gnss=wrong)
+    estimate = replay(run, mode="fixed", outages=[(20.0, 10.0)], batch=batch).estimate
+    assert any("GNSS velocities left out: not the rate" in note for note in estimate.notes)
+    off_m = estimate.trajectory.position_m[-1, :2] - truth.position_m[-1, :2]
+    assert np.hypot(*off_m) < 1.0, "10 s after the last fix"
+
+
+def believed_after(
+    test: VelocityTest, times_s: range, sigma_m: float, speed: float = 1.0, multipath_m: float = 0.0
+) -> bool:
+    """Whether velocities are believed after fixes on a loop at 1 m/s, each second.
+
+    Velocities are `speed` times the right ones; `multipath_m` is by how much positions wander.
+    """
+    rng = np.random.default_rng(1)
+    for t_s in times_s:
+        course = np.exp(0.05j * t_s)
+        place = course / 0.05j
+        fix_m = place + multipath_m * np.sin(t_s / 3.0) + sigma_m * complex(*rng.normal(size=2))
+        v = speed * course
+        fix = GnssFix(
+            t_s * 10**9,
+            np.array([fix_m.real, fix_m.imag, 0.0]),
+            np.full(3, sigma_m),
+            np.array([v.real, v.imag, np.nan]),
+            0.05,
+        )
+        test.add(FixPair(fix.t_ns, 1j * place, fix_m, sigma_m), fix, 1.0)
+    return test.refuted_along is None
+
+
+@pytest.mark.parametrize("sigma_m", [0.02, 2.0])
+def test_right_velocities_stay_and_wrong_ones_come_back_once_they_agree(sigma_m: float) -> None:
+    test = VelocityTest()
+    assert believed_after(test, range(600), sigma_m)
+    assert not believed_after(test, range(600, 1000), sigma_m, speed=-1.0)
+    assert believed_after(test, range(1000, 1600), sigma_m)
+
+
+def test_positions_that_wheels_contradict_refute_no_velocities() -> None:
+    assert believed_after(VelocityTest(), range(600), 0.02, multipath_m=3.0)
