@@ -62,7 +62,7 @@ MOVING_MPS = 0.05
 LEAST_APART = 3
 """Messages of each wheel between which those of wheels apart are interpolated."""
 MOST_WITHOUT_NUMBER = 0.01
-"""Share of an IMU's messages that glitches of its driver may take; more is a fault of the log."""
+"""Share of a topic's messages that glitches of its driver may take; more is a fault of the log."""
 SIDEWAYS_SHARE = 0.5
 """Wheels do not move sideways: so much beside the forward speed is a twist in another frame."""
 
@@ -90,8 +90,8 @@ class ChannelBuilder:
     def command(self, stream: Stream, t_ns: TimesNs) -> Command:
         """Commanded twists."""
         twist, _ = twists(stream)
-        self._refuse_nan(twist[:, [0, 5]], t_ns, stream.topic)
-        return Command(t_ns, twist[:, 0], twist[:, 5])
+        held = self._numbered("command", twist[:, [0, 5]], t_ns, stream.topic)
+        return Command(t_ns[held], twist[held, 0], twist[held, 5])
 
     def imu(self, stream: Stream, t_ns: TimesNs) -> Imu:
         """Rates and specific forces in body axes; first messages may lack numbers, and a few later ones."""
@@ -103,11 +103,7 @@ class ChannelBuilder:
             known = ~np.isnan(values).all(axis=0)
             if not known.any():
                 self.notes.append(f"imu: {stream.topic} has no {what}")
-            finite = np.asarray(np.isfinite(values[:, known]).all(axis=1))
-            begin = int(np.argmax(finite))
-            if not finite[begin:].mean() >= 1.0 - MOST_WITHOUT_NUMBER:
-                self._refuse_nan(values[begin:, known], t_ns[begin:], stream.topic, what)
-            held &= finite
+            held &= self._finite(values[:, known], t_ns, stream.topic, what)
         held = self._held("imu", stream.topic, held)
         return Imu(t_ns[held], *(values[held] for values in self._to_body("imu", stream, gyro, accel)))
 
@@ -134,6 +130,9 @@ class ChannelBuilder:
             lost = int((~held).sum())
             self.notes.append(f"{name}: {lost} of {len(held)} messages of {topic} hold no number; left out")
         return held
+
+    def _numbered(self, name: str, values: Array, t_ns: TimesNs, topic: str, what: str = "number") -> Mask:
+        return self._held(name, topic, self._finite(values, t_ns, topic, what))
 
     def _to_body(self, name: str, stream: Stream, *vectors: Array) -> tuple[Array, ...]:
         frames = sorted(set(stream.frame_ids.tolist()))
@@ -182,16 +181,12 @@ class ChannelBuilder:
         if stream.msgtype in ACKERMANN_AT:
             self._note_command("wheels", stream)
             speed = stream.column(f"{ACKERMANN_AT[stream.msgtype]}speed").astype(float)[:, None]
-            self._refuse_nan(speed, t_ns, stream.topic, "speed")
-            return Wheels(t_ns, speed, ("speed",), "mps"), None
+            held = self._numbered("wheels", speed, t_ns, stream.topic, "speed")
+            return Wheels(t_ns[held], speed[held], ("speed",), "mps"), None
         twist, variance = twists(stream)
-        begin = int(np.argmax(np.isfinite(twist[:, 0])))
-        if begin:
-            self.notes.append(f"wheels: {stream.topic}: the first {begin} messages hold no number; left out")
-            stream, t_ns = stream.select(np.arange(begin, len(t_ns))), t_ns[begin:]
-            twist, variance = twist[begin:], variance[begin:]
+        held = self._numbered("wheels", twist[:, :1], t_ns, stream.topic, "speed")
+        stream, t_ns, twist, variance = stream.select(held), t_ns[held], twist[held], variance[held]
         v, rate = twist[:, 0], twist[:, 5]
-        self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
         if stream.msgtype == topics.TWIST:
             self.notes.append(f"wheels: {stream.topic} has no stamps; its times are those of arrival")
         sideways = float(np.nanstd(twist[:, 1])) if len(twist) > 1 else 0.0
@@ -210,7 +205,8 @@ class ChannelBuilder:
                 return None, None
         if self._says_no_yaw(stream, rate, variance[:, 5], v, imu):
             return Wheels(t_ns, v[:, None], ("speed",), "mps"), None
-        self._refuse_nan(rate[:, None], t_ns, stream.topic, "yaw rate")
+        held = self._numbered("wheels", rate[:, None], t_ns, stream.topic, "yaw rate")
+        t_ns, v, rate = t_ns[held], v[held], rate[held]
         track = self.rig.track_m if self.rig else self.known.track_m or NOMINAL_TRACK_M
         assumed = None if self.rig or self.known.track_m else NOMINAL_TRACK_M
         if assumed:
@@ -270,8 +266,9 @@ class ChannelBuilder:
             )
         if speed is None:
             raise DataError("joints have neither velocity nor position", channel=stream.topic)
-        self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
-        return Wheels(t_ns, speed, tuple(joints), "radps", angle)
+        held = self._numbered("wheels", speed, t_ns, stream.topic, "wheel speed")
+        angle = None if angle is None else angle[held]
+        return Wheels(t_ns[held], speed[held], tuple(joints), "radps", angle)
 
     def _unwrapped(
         self, angle: Array | None, speed: Array | None, names: tuple[str, ...], topic: str
@@ -314,8 +311,8 @@ class ChannelBuilder:
         if stream.msgtype in ACKERMANN_AT:
             self._note_command("steering", stream)
             angle = stream.column(f"{ACKERMANN_AT[stream.msgtype]}steering_angle").astype(float)[:, None]
-            self._refuse_nan(angle, t_ns, stream.topic, "steering angle")
-            return Steering(t_ns, angle, ("angle",))
+            held = self._numbered("steering", angle, t_ns, stream.topic, "steering angle")
+            return Steering(t_ns[held], angle[held], ("angle",))
         for names, joints in steering_joints(joint_names(stream)).items():
             held = holding(stream, joints)
             angles = joint_values(stream.select(held), joints, "position") if held.any() else None
@@ -324,7 +321,9 @@ class ChannelBuilder:
                     f"steering: {', '.join(joints)} of {stream.topic} have no position; left out"
                 )
                 return None
-            self._refuse_nan(angles, t_ns[held], stream.topic, "steering angle")
+            t_ns = t_ns[held]
+            held = self._numbered("steering", angles, t_ns, stream.topic, "steering angle")
+            angles = angles[held]
             self.notes.append(f"steering: joints of {stream.topic}: {', '.join(names)} = {', '.join(joints)}")
             if len(joints) > len(names):
                 angles = angles.mean(axis=1, keepdims=True)
@@ -402,8 +401,9 @@ class ChannelBuilder:
 
     def truth(self, stream: Stream, t_ns: TimesNs) -> tuple[Trajectory, str]:
         """Ground truth, and which point it is of: "base" or "antenna"."""
+        held = self._numbered("truth", poses(stream)[0][:, :2], t_ns, stream.topic, "position")
+        stream, t_ns = stream.select(held), t_ns[held]
         position, quaternion, covariance = poses(stream)
-        self._refuse_nan(position[:, :2], t_ns, stream.topic, "position")
         orientation: Array | None = quaternion
         if not np.abs(np.linalg.norm(quaternion, axis=1) - 1.0).max(initial=0.0) <= 0.01:
             self.notes.append(f"truth: {stream.topic} has no valid quaternions; only the position is used")
@@ -433,13 +433,17 @@ class ChannelBuilder:
         twist[variance >= UNKNOWN_VARIANCE] = np.nan
         return twist if np.nan_to_num(twist).any() else None
 
-    def _refuse_nan(self, values: Array, t_ns: TimesNs, topic: str, what: str = "number") -> None:
-        bad = ~np.isfinite(values).all(axis=1)
-        if bad.any():
-            i = int(np.flatnonzero(bad)[0])
+    def _finite(self, values: Array, t_ns: TimesNs, topic: str, what: str = "number") -> Mask:
+        """Mask (N,) of the messages with numbers; a DataError if more than the first and a few have none."""
+        finite = np.asarray(np.isfinite(values).all(axis=1))
+        begin = int(np.argmax(finite)) if len(finite) else 0
+        bad = ~finite[begin:]
+        if bad.sum() > MOST_WITHOUT_NUMBER * len(bad):
+            i = begin + int(np.argmax(bad))
             raise DataError(
-                f"{int(bad.sum())} of {len(values)} messages have no finite {what}",
+                f"{int(bad.sum())} of {len(bad)} messages have no finite {what}",
                 channel=topic,
                 time_s=float(t_ns[i] - self.start_ns) * 1e-9,
                 remedy="correct the driver, or filter these messages out of the bag",
             )
+        return finite

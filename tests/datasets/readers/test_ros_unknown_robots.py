@@ -121,6 +121,17 @@ def test_joints_without_numbers_until_the_hardware_answers_are_left_out(tmp_path
         open_recording(joint_bag(tmp_path / "later", np.zeros((20, 2)), speed))
 
 
+def test_seldom_wheels_without_numbers_are_left_out_as_of_an_imu(tmp_path: Path) -> None:
+    speed = np.full((200, 2), 2.0)
+    speed[90, 0] = np.nan
+    recording = open_recording(
+        joint_bag(tmp_path / "bag", np.cumsum(0.1 * np.nan_to_num(speed), axis=0), speed)
+    )
+    assert recording.wheels is not None
+    assert recording.wheels.speed.tolist() == [[2.0, 2.0]] * 199
+    assert any("1 of 200 messages of /base/joints hold no number" in note for note in recording.notes)
+
+
 def bag_beside_imu(path: Path, topic: str, msgtype: str, *messages: Any) -> Path:
     """An IMU and another topic, at 20 Hz."""
     found = [(topic, msgtype, T0 + k * 50_000_000, message) for k, message in enumerate(messages)]
