@@ -26,6 +26,7 @@ from terrafusion.datasets.core.channels import (
     Wheels,
 )
 from terrafusion.datasets.core.messages import Message
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.quantity import Quantity, Whole
 from terrafusion.datasets.core.tables import clock_line, clock_rows, clock_table_html
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -162,7 +163,8 @@ class Recording:
     def _title(self) -> str:
         robot = self.vehicle or "unnamed vehicle"
         ground = f", {self.terrain_name}" if self.terrain_name else ""
-        return f"Recording '{self.name}': {robot}{ground}, {self.duration_s():.1f} s, {len(self.notes)} notes"
+        notes = counted(len(self.notes), "note")
+        return f"Recording '{self.name}': {robot}{ground}, {self.duration_s():.1f} s, {notes}"
 
     def _rows(self) -> list[tuple[str, ...]]:
         return clock_rows(self.clocks(), self.start_ns)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import yaw_of
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.core.trajectory import Trajectory
 
@@ -163,7 +164,7 @@ class Estimate:
                 if len(t_ns)
                 else "  slip: none",
                 f"  {len(self.changes)} changes of weights, {len(self.innovations)} innovations, "
-                f"{len(self.notes)} notes",
+                f"{counted(len(self.notes), 'note')}",
             ]
         )
 

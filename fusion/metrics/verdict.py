@@ -320,7 +320,7 @@ def _rejections(run: Run) -> Iterator[Reason]:
         then = f", until {since_s(run, fixes[end].t_ns):.0f} s" if end < len(fixes) else ", to the end"
     what = ": either they or the estimate are wrong there"
     if any(i.reason == JUMPED for i in part):
-        what = ": they jumped there as no robot moves (a wrong ambiguity of RTK, say)" + (
+        what = ": they jumped there as no robot moves (a wrong ambiguity or a reflected signal, say)" + (
             "; either they are wrong after it, or those before it"
             if part[-1].accepted
             else " and were held off"
