@@ -242,7 +242,7 @@ class FixPlausibility:
         return True
 
     def _jumped(self, run: FixRun, heading: complex, scale: float, white: float) -> bool:
-        """Test a run for a jump; True where it leads back to the place before the last one."""
+        """Test a run for a jump; True where it undoes the last one, or leads back to where most fixes lay."""
         run.jump = jump = FixJump.of(list(self._used)[-USED:], run.pairs, heading, scale, white)
         if jump is None:
             return False

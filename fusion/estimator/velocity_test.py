@@ -22,7 +22,8 @@ time for it: beyond, what they are off at rest counts."""
 GAP_S = 2.5
 """Longest time between two velocities that are integrated."""
 WRONG = 0.1
-"""Distance between integral and displacement over the sum of both: a factor of 1.2, or 12 degrees."""
+"""Distance between integral and displacement over the sum of both: a factor of 1.2, or 12 degrees
+(assumed)."""
 LEAST, MOST, SIGMAS = 4, 20, 3.0
 """Chords that refute velocities at least, the most that count, and sigmas of their mean."""
 BETTER = 0.5

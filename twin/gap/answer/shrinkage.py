@@ -111,7 +111,8 @@ def _errors_left_out(
     was: list[Array],
 ) -> list[Array]:  # fmt: skip
     """Errors of each run with the effect at its values fitted to the other runs, on the better of two soils:
-    the one that fits the run without the effect may hold a part of it, the references' holds none."""
+    the one that fits the run without the effect may hold a part of it, the references' holds none. Without
+    the effect the first is the better one: its search begins at the second."""
     runs, tried = evidence.runs, list[RunWithEffects]()
     for i, x in enumerate(values):
         effects = evidence.candidates.changed(fit.columns, np.concatenate(x))
