@@ -21,6 +21,7 @@ from terrafusion.fusion.calibration.numbers import (
     COURSE_LAG,
     GNSS_DELAY,
     GYRO_BIAS,
+    SLIP_PER_GRADE,
     TURN_SCALE,
     WHEEL_DELAY,
     WHEEL_SCALE,
@@ -50,6 +51,7 @@ ROWS = {
     "gnss_delay_s": GNSS_DELAY,
     "wheel_delay_s": WHEEL_DELAY,
     "course_lag_s": COURSE_LAG,
+    "slip_per_grade": SLIP_PER_GRADE,
 }
 OF_GYRO, OF_WHEELS = ("gyro_scale", "gyro_bias_radps"), ("yaw_factor",)
 """Numbers that exist where the yaw rate comes from the gyro, and from the wheels."""

@@ -143,6 +143,7 @@ class SensorNumbers:
         wheel_scale: true distance over that of the wheels, less one; usual slip included.
         gnss_delay_s, wheel_delay_s: lateness of the stamps against those of the IMU.
         course_lag_s: time by which the course follows the heading, of a robot that skids outwards in turns.
+        slip_per_grade: additional slip over the sine of the slope, uphill positive.
         imu_roll_rad, imu_pitch_rad, imu_yaw_rad: angles at which the IMU is mounted: readings turned about x,
             then y, then z by them are in body axes.
     """
@@ -155,6 +156,7 @@ class SensorNumbers:
     gnss_delay_s: Delay | None = None
     wheel_delay_s: Delay | None = None
     course_lag_s: Delay | None = None
+    slip_per_grade: Annotated[KnownNumber, Known(Quantity("", -1.0, 5.0))] | None = None
     imu_roll_rad: Tilt | None = None
     imu_pitch_rad: Tilt | None = None
     imu_yaw_rad: Annotated[KnownNumber, Known(Quantity("rad", -3.1416, 3.1416))] | None = None

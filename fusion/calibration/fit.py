@@ -48,5 +48,5 @@ def started(drive: MotionSegment, start: complex, yaw_rad: float, numbers: Array
 
 
 def information_gained(before: Knowledge, after: Knowledge) -> Array:
-    """Information gained on each number (8,), nats: the logarithm of its sigma before over after."""
+    """Information gained on each number (9,), nats: the logarithm of its sigma before over after."""
     return np.asarray(np.log(before.sigma / after.stated_sigma(before)))

@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.numbers import COURSE_LAG, GYRO_BIAS, NUMBERS, TURN_SCALE, WHEEL_DELAY
+from terrafusion.fusion.calibration.numbers import (
+    COURSE_LAG,
+    GYRO_BIAS,
+    NUMBERS,
+    SLIP_PER_GRADE,
+    TURN_SCALE,
+    WHEEL_DELAY,
+)
 
 Complex = NDArray[np.complex128]
 
@@ -32,6 +39,7 @@ class MotionSegment:
         antenna_m: nominal lever arm, forward + i left, m.
         first: (M,) samples at which a node begins, from 0 on.
         course_rad: (N,) angle from the body's x axis to where the wheels roll, as steered; None: along it.
+        climb_m: (N,) unsigned distance times the sine of the body's slope, x axis up; None: on the level.
     """
 
     t_s: Array
@@ -43,6 +51,7 @@ class MotionSegment:
     antenna_m: complex = 0j
     first: NDArray[np.intp] = field(default_factory=lambda: np.zeros(1, dtype=np.intp))
     course_rad: Array | None = None
+    climb_m: Array | None = None
 
 
 def node_due(apart_s: float, rolled_m: float, fix_sigma_m: float) -> bool:
@@ -58,8 +67,8 @@ class Path:
     Attributes:
         yaw_rad: (N + 1,) from 0.
         z: (N + 1,) position without slip, east + i north for yaw 0 at the start, m.
-        yaw_by: (N + 1, 8) derivatives of the yaw by `NUMBERS`; zero where there is none.
-        z_by: (N + 1, 8) of the position.
+        yaw_by: (N + 1, 9) derivatives of the yaw by `NUMBERS`; zero where there is none.
+        z_by: (N + 1, 9) of the position.
     """
 
     yaw_rad: Array
@@ -69,7 +78,7 @@ class Path:
 
 
 def dead_reckoned(drive: MotionSegment, numbers: Array, begin: int = 0, end: int | None = None) -> Path:
-    """The path of `drive` by wheels and turns with `numbers` (8,), from sample `begin` to `end`."""
+    """The path of `drive` by wheels and turns with `numbers` (9,), from sample `begin` to `end`."""
     end = len(drive.t_s) - 1 if end is None else end
     t_s = drive.t_s[begin : end + 1]
     dt, distance_m = np.diff(t_s), drive.distance_m[begin:end]
@@ -78,6 +87,8 @@ def dead_reckoned(drive: MotionSegment, numbers: Array, begin: int = 0, end: int
     yaw = _summed(turn)
     gained = _speed_gained(drive, begin, end)
     step = distance_m + numbers[WHEEL_DELAY] * gained
+    climb_m = np.zeros(len(step)) if drive.climb_m is None else drive.climb_m[begin:end]
+    step = step - numbers[SLIP_PER_GRADE] * climb_m
     per_s = 1.0 / np.maximum(dt, LEAST_STEP_S)
     lag_s, rate = numbers[COURSE_LAG], turn * per_s
     middle = np.exp(1j * (0.5 * (yaw[1:] + yaw[:-1]) - lag_s * rate))
@@ -91,6 +102,7 @@ def dead_reckoned(drive: MotionSegment, numbers: Array, begin: int = 0, end: int
         by = 0.5 * (yaw_by[1:, number] + yaw_by[:-1, number]) - lag_s * np.diff(yaw_by[:, number]) * per_s
         z_by[:, number] = _summed(1j * by * step * middle)
     z_by[:, WHEEL_DELAY] = _summed(gained * middle)
+    z_by[:, SLIP_PER_GRADE] = _summed(-climb_m * middle)
     z_by[:, COURSE_LAG] = _summed(-1j * rate * step * middle)
     return Path(yaw, _summed(step * middle), yaw_by, z_by)
 

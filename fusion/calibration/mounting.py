@@ -3,10 +3,12 @@
 Over a second the body gains the speed that the wheels gain, ahead, and speed times turn to its left; an IMU
 away from the body's origin gains more as the body turns. A turned IMU measures the same vector rotated::
 
-    y = e^(-i angle) (change of speed + i speed turn + place (i change of rate - time rate^2)) + constant
+    y = e^(-i angle) (change of speed + i speed turn + place (i change of rate - time rate^2)) + bias + g up
 
 with complex numbers for vectors (ahead + i left), which is linear in e^(-i angle) and in its product with the
-place. The constant, gravity on a slope and bias, is taken out of each block of some ten seconds.
+place. On slopes the vertical's share `up` in the IMU's plane turns with the robot and follows the gyro,
+d up / dt = i (rate about x + i rate about y - rate about z up), whatever the angle: what it gains in a block
+of some twenty seconds is taken off; its start and the biases of gyro and force are fitted in each block.
 
 Slip makes errors that last for a block: sigma follows the scatter between blocks (Liang and Zeger 1986,
 sandwich estimator), and is wider by as much as the angles from speed and from turns alone disagree beyond
@@ -22,13 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.fusion.calibration.motion import Complex
 
-WINDOW_S, BLOCK = 1.0, 10
-"""Time over which speeds are compared, longer than most vibration, and windows with one constant."""
-LEAST_FREEDOM = 18
-"""Windows, less one a block, before there is an angle."""
+WINDOW_S, BLOCK = 1.0, 20
+"""Time over which speeds are compared, longer than most vibration, and windows with one bias."""
+LEAST_FREEDOM = 17
+"""Windows, less the constants of their blocks, before there is an angle."""
 LEAST_ALONG, LARGEST_SIGMA = 0.5, 0.35
 """The change of speed and the turns are fitted alone, too: each must be known this well and point the way of
 both. A hill on which a robot always slows down turns the vector round, but only one of them (assumed)."""
@@ -43,6 +46,8 @@ STILL_CLEAR = 0.5
 """A correction ends at this share of the limits at which it begins (assumed)."""
 PLACE_M = 0.5
 """1 sigma of the place of the IMU, each axis: it is somewhere on a robot (assumed)."""
+LEVEL_START = 0j, 1.0 + 0j, 0j
+"""At the start of a block: `up` less its start, and its derivatives by that start and by the gyro's bias."""
 JOINT = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 1.0]])
 """Columns of speed and turn become that of the vector that both make; that of the place stays."""
 
@@ -100,8 +105,9 @@ class MountingAngle:
 
     def __init__(self) -> None:
         self.angle: Angle | None = None
-        self._moves: list[tuple[float, float, float, complex]] = []
-        self._windows: list[tuple[float, float, complex, complex]] = []
+        self._moves: list[tuple[float, float, float, complex, complex, complex]] = []
+        self._windows: list[tuple[float, float, complex, complex, complex, complex]] = []
+        self._up = LEVEL_START
         self._square, self._product = np.zeros((3, 3), dtype=complex), np.zeros(3, dtype=complex)
         self._between = np.zeros((6, 6), dtype=complex)
         self._energy, self._freedom = 0.0, 0
@@ -109,29 +115,39 @@ class MountingAngle:
     def interrupt(self) -> None:
         """Wheels or IMU are missing, or the wheels do not roll: begin a new window."""
         self._moves, self._windows = [], []
+        self._up = LEVEL_START
 
-    def add(self, dt_s: float, rolled_m: float, turn_rad: float, force_mps2: Array) -> bool:
-        """Motion over `dt_s` by wheels and gyro, mean specific force (3,); True when the angle changed."""
-        self._moves.append((dt_s, rolled_m / dt_s, turn_rad, complex(*force_mps2[:2]) * dt_s))
+    def add(self, dt_s: float, rolled_m: float, gyro_radps: Array, force_mps2: Array) -> bool:
+        """Wheels, mean rates (3,) and specific force (3,) over `dt_s`; True when the angle changed."""
+        turn_rad, tilt_rad = float(gyro_radps[2]) * dt_s, complex(*gyro_radps[:2]) * dt_s
+        middle = _tilted(self._up, 0.5 * dt_s, 0.5 * turn_rad, 0.5 * tilt_rad)
+        self._up = _tilted(middle, 0.5 * dt_s, 0.5 * turn_rad, 0.5 * tilt_rad)
+        up, by_start, by_bias = middle
+        gained_mps = (complex(*force_mps2[:2]) - GRAVITY_MPS2 * up) * dt_s
+        self._moves.append((dt_s, rolled_m / dt_s, turn_rad, gained_mps, by_start * dt_s, by_bias * dt_s))
         if sum([move[0] for move in self._moves]) < WINDOW_S + dt_s:
             return False
-        dt, speed_mps, turn, gained_mps = np.array(self._moves).T
+        moves = np.array(self._moves).T
+        dt, speed_mps, turn = moves[:3]
         weight = np.ones(len(self._moves))
         weight[[0, -1]] = 0.5  # speeds are means of their interval: they hold at its middle
         ahead = float((speed_mps[-1] - speed_mps[0]).real)
         left = float((weight * speed_mps * turn).sum().real)
         rate = (turn / dt).real
         velocity_by_lever = complex(-float((weight * turn.real * rate).sum()), rate[-1] - rate[0])
-        self._windows.append((ahead, left, velocity_by_lever, complex((weight * gained_mps).sum())))
+        measured, by_start, by_bias = (moves[3:] @ weight).tolist()
+        self._windows.append((ahead, left, velocity_by_lever, measured, by_start, by_bias))
         self._moves = self._moves[-1:]
         if len(self._windows) < BLOCK:
             return False
         self._add_block(np.array(self._windows))
-        self._windows = []
+        self._windows, self._up = [], LEVEL_START
         return True
 
     def _add_block(self, windows: Complex) -> None:
-        about = windows - windows.mean(axis=0)
+        constant = np.column_stack([np.ones(len(windows)), windows[:, 4:]])
+        fitted, _, rank, _ = np.linalg.lstsq(constant, windows[:, :4], rcond=1e-3)
+        about = windows[:, :4] - constant @ fitted
         moved, measured = about[:, :3], about[:, 3]
         square, product = moved.conj().T @ moved, moved.conj().T @ measured
         self._square += square
@@ -139,7 +155,7 @@ class MountingAngle:
         joint = np.concatenate([JOINT.conj().T @ product, (JOINT.conj().T @ square @ JOINT).ravel()])
         self._between += np.outer(joint, joint.conj())
         self._energy += float((np.abs(measured) ** 2).sum())
-        self._freedom += len(windows) - 1
+        self._freedom += len(windows) - int(rank)
         self.angle = self._fitted()
 
     def _fitted(self) -> Angle | None:
@@ -170,3 +186,12 @@ class MountingAngle:
         inverse = np.linalg.inv(self._square + np.diag([0.0, 0.0, place_prior]))
         alone = (inverse @ self._product)[:2] * np.array([1.0, -1j])
         return alone, np.sqrt(0.5 * noise * np.diag(inverse)[:2].real)
+
+
+def _tilted(
+    up: tuple[complex, complex, complex], dt_s: float, turn_rad: float, tilt_rad: complex
+) -> tuple[complex, complex, complex]:
+    """The vertical's share as in `LEVEL_START` after `dt_s` in which the IMU turns and tilts."""
+    back, half = cmath.exp(-1j * turn_rad), cmath.exp(-0.5j * turn_rad)
+    now, by_start, by_bias = up
+    return now * back + 1j * tilt_rad * half, by_start * back, by_bias * back + 1j * dt_s * half

@@ -22,6 +22,7 @@ NUMBERS = (
     "gnss_delay_s",
     "wheel_delay_s",
     "course_lag_s",
+    "slip_per_grade",
 )
 """In the order of every vector of numbers:
 
@@ -32,10 +33,10 @@ NUMBERS = (
 - gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw. Wheels that slip while
   they accelerate are ahead of the robot, as if they were early.
 - course_lag: time by which the course follows the heading: in a turn at rate w a robot drifts outwards by
-  the angle course_lag w."""
-TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY, COURSE_LAG = range(
-    len(NUMBERS)
-)
+  the angle course_lag w.
+- slip_per_grade: additional slip over the sine of the slope, uphill positive."""
+TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY, COURSE_LAG = range(8)
+SLIP_PER_GRADE = 8
 
 GYRO_SCALE_SIGMA, SKID_TURN_SIGMA, ROLL_TURN_SIGMA = 0.015, 0.35, 0.15
 """Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), that
@@ -53,21 +54,24 @@ robots of `unseen_robots` below seed 24)."""
 SKIDDING_LAG_SIGMA_S, ROLLING_LAG_SIGMA_S = 0.15, 0.005
 """Course lag of wheels and tracks that skid in every turn (a Warthog's on asphalt, grass and gravel: 0.1 to
 0.3 s, study `course_lag`), and of those that roll (assumed)."""
+LEAST_GRADE_SIGMA = 0.1
+"""The slip per grade that is expected is known to as much again, and no better than this (assumed; the
+policy's grounds have 0.13 to 1.05)."""
 NO_LAG_SIGMA_S = 1e-3
 """1 sigma with which a course lag that cannot be negative is held to 0 while a drive is learned from."""
-IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0])
+IMITATED = np.array([0.003, 0.0, 0.0, 0.07, 0.07, 0.15, 0.0, 0.0, 0.0])
 """1 sigma of what a drive does to `NUMBERS` that no more driving averages out: a path that lags by slip looks
 like late fixes, side-slip in turns like another antenna (set on robots of `unseen_robots` below seed 24)."""
 COMMON_DELAY_S, TURN_SLIP_M = 0.1, 0.25
 """1 sigma of the two changes of `feigned_by_slip`: clean drives of the twin below seed 50 showed 0.1 to
 0.5 s, and 0.03 to 0.2 m, more on mud. With more than 0.1 s an antenna 0.6 m off on asphalt is not seen."""
-CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01, 0.05]), 0.05
+CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01, 0.05, 0.1]), 0.05
 """Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
 the turn scale where there is no gyro."""
 
 
 def feigned_by_slip(one_sided: float) -> Array:
-    """Changes (8, 2) of `NUMBERS` that slip feigns, of 1 sigma each, on robots that skid in turns.
+    """Changes (9, 2) of `NUMBERS` that slip feigns, of 1 sigma each, on robots that skid in turns.
 
     Fixes and wheels that come later by as much as the course leads the heading leave the path as it is, to
     first order of the delays: what is left is smaller than slip. Wheels that slip in a turn by a length for
@@ -87,8 +91,8 @@ class Knowledge:
     """Mean and covariance of `NUMBERS`, and how slip changes between stretches of ground.
 
     Attributes:
-        mean: (8,).
-        covariance: (8, 8).
+        mean: (9,).
+        covariance: (9, 9).
         slip_spread: standard deviation of the distance ratio about `wheel_scale`.
         slip_time_s: correlation time of that ratio.
         misfit: variance of the fixes' residuals over that of their white noise; at least 1.
@@ -104,7 +108,7 @@ class Knowledge:
 
     @functools.cached_property
     def sigma(self) -> Array:
-        """1 sigma (8,), read-only."""
+        """1 sigma (9,), read-only."""
         sigma = np.sqrt(np.diag(self.covariance))
         sigma.flags.writeable = False
         return np.asarray(sigma)
@@ -135,13 +139,13 @@ class Knowledge:
         return mean, covariance[np.ix_(rows, rows)] - gain @ covariance[np.ix_(held, rows)]
 
     def with_covariance(self, covariance: Array, wide: Self) -> Self:
-        """With another covariance (8, 8), scaled so that no number is known less well than in `wide`."""
+        """With another covariance (9, 9), scaled so that no number is known less well than in `wide`."""
         limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
         shrink = np.sqrt(limit / np.diag(covariance))
         return dataclasses.replace(self, covariance=covariance * np.outer(shrink, shrink))
 
     def stated_sigma(self, before: Self, misfit: float = 1.0) -> Array:
-        """1 sigma (8,) with what slip imitates; at most that `before` the drive.
+        """1 sigma (9,) with what slip imitates; at most that `before` the drive.
 
         That grows with the `misfit`: what slip leaves of the fixes' residuals is a measure of the rest.
         """
@@ -157,6 +161,7 @@ def assumed(
     slip_time_s: float,
     skids: bool = False,
     wheelbase_m: float = 0.0,
+    slip_per_grade: float = 0.0,
 ) -> Knowledge:
     """What is known of a robot before it drives; `skids`: its wheels or tracks skid in every turn."""
     sigma = np.array(
@@ -169,9 +174,12 @@ def assumed(
             GNSS_DELAY_SIGMA_S,
             SKIDDING_WHEEL_SIGMA_S if skids else ROLLING_WHEEL_SIGMA_S,
             SKIDDING_LAG_SIGMA_S if skids else ROLLING_LAG_SIGMA_S,
+            max(abs(slip_per_grade), LEAST_GRADE_SIGMA),
         ]
     )
-    return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread, slip_time_s)
+    mean = np.zeros(len(sigma))
+    mean[SLIP_PER_GRADE] = slip_per_grade
+    return Knowledge(mean, np.diag(sigma**2), slip_spread, slip_time_s)
 
 
 def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
@@ -219,6 +227,7 @@ def _rows(known: SensorNumbers, yaw: str) -> dict[int, KnownNumber]:
         GNSS_DELAY: known.gnss_delay_s,
         WHEEL_DELAY: known.wheel_delay_s,
         COURSE_LAG: known.course_lag_s,
+        SLIP_PER_GRADE: known.slip_per_grade,
     }
     return {row: number for row, number in rows.items() if number is not None}
 

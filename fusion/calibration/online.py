@@ -49,11 +49,13 @@ class SelfCalibration:
         self._start_ns: int | None = None
         self._start: tuple[complex, float] = (0j, 0.0)
         none = np.zeros(0)
-        self._drive = MotionSegment(np.zeros(1), none, none, antenna_m=self._antenna_m, course_rad=none)
+        self._drive = MotionSegment(
+            np.zeros(1), none, none, antenna_m=self._antenna_m, course_rad=none, climb_m=none
+        )
         self._first: list[int] = [0]
         self._now_s, self._node_s, self._stepped_s, self._rolled_m = 0.0, 0.0, 0.0, 0.0
-        # Newer than `_drive`: time, distance, turn, course of samples; time, east, north, sigma of fixes.
-        self._samples: list[tuple[float, float, float, float]] = []
+        # Newer than `_drive`: time, distance, turn, course, climb; of fixes time, east, north, sigma.
+        self._samples: list[tuple[float, float, float, float, float]] = []
         self._fixes: list[tuple[float, float, float, float]] = []
         self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
         self.usual_sigma_m = self.turned_rad = 0.0
@@ -78,11 +80,12 @@ class SelfCalibration:
         position_m: Array,
         yaw_rad: float,
         course_rad: float = 0.0,
+        grade: float = 0.0,
     ) -> None:
         """Motion since the last call, by the wheels and by the source of yaw as measured.
 
         `position_m` (2,) and `yaw_rad` are the estimate at `t_ns`, where a stretch begins; `course_rad` is of
-        `MotionSegment`.
+        `MotionSegment`, `grade` the sine of the body's slope, x axis up.
         """
         if distance_m is None:
             self.restart()
@@ -91,7 +94,7 @@ class SelfCalibration:
             self._start_ns, self._start = t_ns, (complex(*position_m[:2]), yaw_rad)
             return
         self._now_s = (t_ns - self._start_ns) * 1e-9
-        self._samples.append((self._now_s, distance_m, turn_rad, course_rad))
+        self._samples.append((self._now_s, distance_m, turn_rad, course_rad, abs(distance_m) * grade))
         self._rolled_m += abs(distance_m)
         self.turned_rad += abs(turn_rad)
         apart_s = self._now_s - self._node_s
@@ -173,14 +176,15 @@ class SelfCalibration:
 
 def _extended(
     drive: MotionSegment,
-    samples: Sequence[tuple[float, float, float, float]],
+    samples: Sequence[tuple[float, float, float, float, float]],
     fixes: Sequence[tuple[float, float, float, float]],
     first: Sequence[int],
 ) -> MotionSegment:
     """A drive with what came since."""
-    t_s, distance_m, turn_rad, course_rad = np.array(samples).reshape(-1, 4).T
-    if drive.course_rad is not None:
+    t_s, distance_m, turn_rad, course_rad, climb_m = np.array(samples).reshape(-1, 5).T
+    if drive.course_rad is not None and drive.climb_m is not None:
         course_rad = np.concatenate([drive.course_rad, course_rad])
+        climb_m = np.concatenate([drive.climb_m, climb_m])
     fix_t_s, east_m, north_m, sigma_m = np.array(fixes).reshape(-1, 4).T
     return MotionSegment(
         np.concatenate([drive.t_s, t_s]),
@@ -192,4 +196,5 @@ def _extended(
         drive.antenna_m,
         np.array(first),
         course_rad,
+        climb_m,
     )

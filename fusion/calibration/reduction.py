@@ -75,10 +75,10 @@ class Reduction:
         part: the drive; its nodes move with `apply`.
         numbers, spread, noise: about which all is linearised.
         fixes, interval, node: the fixes inside the drive, the sample before each, its node.
-        rows, left: of the fixes, (F, 2, 14) and (F, 2), whitened without the robust weight.
+        rows, left: of the fixes, (F, 2, 15) and (F, 2), whitened without the robust weight.
         diagonal, below, border, own: normal equations of the nodes: blocks (M, 6, 6) of each and of it with
-            the one after; (M, 6, 8) with the numbers; right-hand side (M, 6).
-        information, right: of the numbers, (8, 8) and (8,); without the nodes once all is done.
+            the one after; (M, 6, 9) with the numbers; right-hand side (M, 6).
+        information, right: of the numbers, (9, 9) and (9,); without the nodes once all is done.
         factor: Cholesky factor (12, 6 M) of the nodes' band.
         done_nodes, done_fixes: how many are assembled.
         misfit: variance of the fixes' residuals, by their median, over that of their white noise; at least 1.
@@ -138,7 +138,7 @@ class Reduction:
         return False
 
     def without_feigned(self) -> tuple[Array, Array]:
-        """Information (8, 8) and right-hand side (8,) with the changes that slip feigns as unknowns."""
+        """Information (9, 9) and right-hand side (9,) with the changes that slip feigns as unknowns."""
         if not self.noise.skids:
             return self.information, self.right
         changes = feigned_by_slip(_one_sided(self.part.drive))
@@ -193,7 +193,7 @@ class Reduction:
         self.done_fixes += len(rows)
 
     def _add(self, rows: Array, left: Array, node: Places, nodes: int) -> None:
-        """Add whitened rows (m, r, 6 nodes + 8), residuals (m, r), over 1 or 2 nodes from `node` (m,) on."""
+        """Add whitened rows (m, r, 6 nodes + 9), residuals (m, r), over 1 or 2 nodes from `node` (m,) on."""
         if not len(rows):
             return
         across = rows.transpose(0, 2, 1)
@@ -231,7 +231,7 @@ class Reduction:
         return np.asarray(linalg.cho_solve_banded((self.factor, True), right, check_finite=False))
 
     def _fix_rows(self, path: Path, begin: int, chosen: slice) -> tuple[Array, Array]:
-        """Rows (m, 2, 14) and residuals (m, 2) of fixes, by a path from sample `begin` on."""
+        """Rows (m, 2, 15) and residuals (m, 2) of fixes, by a path from sample `begin` on."""
         drive, numbers, node, j = self.part.drive, self.numbers, self.node[chosen], self.interval[chosen]
         at_s = drive.fix_t_s[self.fixes[chosen]] - numbers[GNSS_DELAY]
         dt = drive.t_s[j + 1] - drive.t_s[j]

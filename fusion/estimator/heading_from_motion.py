@@ -40,7 +40,7 @@ class MotionDoubt:
     """What else than white noise of the fixes turns the path that they show.
 
     Attributes:
-        numbers: (8, 8) covariance of `NUMBERS` about those that sensors are corrected by.
+        numbers: (9, 9) covariance of `NUMBERS` about those that sensors are corrected by.
         drift_share: share of a fix's variance that drifts, with `drift_time_s` as correlation time.
     """
 
@@ -146,7 +146,7 @@ def heading_from_motion(
 def _yaw_sigma(
     path: AntennaPath, pull: Complex, t_s: Array, shown: float, random_rad: float, numbers: Array
 ) -> float:
-    """1 sigma of the heading, rad: `random_rad`, and what delay and numbers (8, 8) turn the path by."""
+    """1 sigma of the heading, rad: `random_rad`, and what delay and numbers (9, 9) turn the path by."""
     by_numbers = (pull @ path.by_numbers(t_s)).imag / shown
     by_delay = _turned_by_delay(path, pull, t_s, float(np.sqrt(numbers[GNSS_DELAY, GNSS_DELAY])))
     sigma_rad = float(np.sqrt(random_rad**2 + by_delay**2 + by_numbers @ numbers @ by_numbers))
@@ -209,7 +209,7 @@ class AntennaPath:
     Attributes:
         t_s: (N,) from the start.
         place: (N,) m.
-        by: (N, 8) derivatives by `NUMBERS`, but for the delay of the fixes.
+        by: (N, 9) derivatives by `NUMBERS`, but for the delay of the fixes.
     """
 
     t_s: Array

@@ -68,11 +68,10 @@ class ImuMounting:
             return
         self.level.keyframe(chain, mean, self.known.sigma_rad)
         bias = chain.state(chain.last).bias
-        turn_rad = (float(mean.gyro_radps[2]) - float(bias.gyroscope()[2])) * mean.dt_s
-        was_rad, raw = self._imu.mounting_rad, mean.accel_mps2
+        was_rad, force, gyro = self._imu.mounting_rad, mean.accel_mps2, mean.gyro_radps - bias.gyroscope()
         if was_rad:
-            raw = turned(raw, -was_rad)
-        if not self._seen.add(mean.dt_s, mean.rolled_m, turn_rad, raw) or self._seen.angle is None:
+            force, gyro = turned(force, -was_rad), turned(gyro, -was_rad)
+        if not self._seen.add(mean.dt_s, mean.rolled_m, gyro, force) or self._seen.angle is None:
             return
         seen = self._seen.angle
         found = seen.as_mounted() if self.before.sigma_rad == ANY_ANGLE_RAD else self.before.combined(seen)

@@ -16,6 +16,7 @@ from terrafusion.fusion.calibration.numbers import (
     COURSE_LAG,
     GYRO_BIAS,
     NUMBERS,
+    SLIP_PER_GRADE,
     TURN_SCALE,
     WHEEL_SCALE,
     Knowledge,
@@ -168,7 +169,8 @@ class LearnedNumbers:
         turn_rad = float(mean.gyro_radps[2]) * mean.dt_s / (1.0 + self._imu.turn_scale)  # as measured
         t_ns, pose = chain.nodes[-1].t_ns, chain.state(chain.last).pose
         place, yaw_rad = np.asarray(pose.translation()), pose.rotation().yaw()
-        learning.drive(t_ns, mean.rolled_m, turn_rad, place, yaw_rad, mean.course_rad)
+        grade = float(pose.rotation().matrix()[2, 0])
+        learning.drive(t_ns, mean.rolled_m, turn_rad, place, yaw_rad, mean.course_rad, grade)
 
     def advance(self, chain: Chain) -> None:
         """A slice of learning's work; new numbers correct the sensors from the newest keyframe on."""
@@ -301,6 +303,7 @@ class LearnedNumbers:
         self._gnss.correct(t_ns, np.array([x_m, y_m]), delay_s)
         if not slip:
             return
+        self._weights.learn_grade_slip(float(known.mean[SLIP_PER_GRADE]))
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
         mean, time_s = -float(known.mean[WHEEL_SCALE]), known.slip_time_s / SLIP_STEADY
         self._weights.learn_slip(mean, max(doubt, LEAST_SLIP_SIGMA), time_s, t_ns)
@@ -334,7 +337,15 @@ def prior_of(config: EstimatorConfig) -> Knowledge:
     slip_time_s = SLIP_STEADY * config.policy.fixed.slip_time_s
     skids = config.rig.drive in SKIDDING
     steered_or_wheels = yaw in ("wheels", "steering")
-    wide = assumed(bias_sigma, steered_or_wheels, SLIP_SPREAD, slip_time_s, skids, config.rig.wheelbase_m)
+    wide = assumed(
+        bias_sigma,
+        steered_or_wheels,
+        SLIP_SPREAD,
+        slip_time_s,
+        skids,
+        config.rig.wheelbase_m,
+        config.policy.fixed.slip_per_grade,
+    )
     return known_before(config.rig.known, wide, yaw)
 
 

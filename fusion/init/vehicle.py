@@ -40,6 +40,7 @@ COMMENTS = {
     "gnss_delay_s": "s; lateness of the stamps of the fixes",
     "wheel_delay_s": "s; lateness of the stamps of the wheels",
     "course_lag_s": "s; by which the course follows the heading",
+    "slip_per_grade": "slip over the sine of the slope, uphill",
     "imu_roll_rad": "rad; angle of the IMU about x",
     "imu_pitch_rad": "rad; angle of the IMU about y",
     "imu_yaw_rad": "rad; angle of the IMU about z, to the left",

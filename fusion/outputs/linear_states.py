@@ -35,6 +35,7 @@ SHOWN = QUANTITIES | {
     "turn_scale": ("turns beyond those of the source of yaw", "%", 100.0),
     "wheel_scale": ("distance beyond that of the wheels", "%", 100.0),
     "course_lag_s": ("course behind the heading, in turns", "s", 1.0),
+    "slip_per_grade": ("slip over the sine of the slope", "", 1.0),
 }
 """With the numbers of self-calibration."""
 

@@ -110,6 +110,15 @@ class TerrainNoise:
             self._ground_slip.expect(mean, sigma, float(self._slip_times_s[self._unknown]))
         self._reweight(t_ns)
 
+    def learn_grade_slip(self, per_grade: float) -> None:
+        """Take over the slope of the slip over the grade, on ground that no class describes."""
+        if not self.adaptive:
+            self.noise = dataclasses.replace(self.noise, slip_per_grade=per_grade)
+        elif self._starts_pooled:
+            pooled = dataclasses.replace(self.policy.classes[UNKNOWN], slip_per_grade=per_grade)
+            self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: pooled})
+            self._ground_slip.per_grade = per_grade
+
     def learned_grounds(self) -> GroundMemory | None:
         """What the ground memory holds by now, condensed; None where there is none."""
         return None if self.grounds is None else self.grounds.memory.condensed()

@@ -39,6 +39,7 @@ class GroundSlip:
 
     Attributes:
         mean, sigma: of the slip on the level, now.
+        per_grade: slope of the slip over the grade.
     """
 
     def __init__(
@@ -47,7 +48,8 @@ class GroundSlip:
         k = 1 + MOST_GROUNDS
         self._known = {i: g for i, g in enumerate(known, 1) if g.motion.count[0] >= LEAST_STRETCHES}
         self._belief = np.eye(k)[0]
-        self._slip = DrivenSlip(self._prior(mean, sigma, time_s), np.full(k, per_grade))
+        self.per_grade = per_grade
+        self._slip = DrivenSlip(self._prior(mean, sigma, time_s), np.zeros(k))
         self._followed = mean  # the mean that the slip of the robot follows
         self.expect(mean, sigma, time_s)
 
@@ -75,7 +77,8 @@ class GroundSlip:
     def learn(self, slip: float, sigma: float, grade: float, dt_s: float) -> None:
         """Slip with its 1 sigma, as measured for `dt_s` on the ground that the robot is on."""
         known = np.append(0.0, self._belief[1:])
-        self._slip.add(known, slip, sigma * math.sqrt(WINDOWS_PER_OBSERVATION), grade, dt_s)
+        level = slip - self.per_grade * grade
+        self._slip.add(known, level, sigma * math.sqrt(WINDOWS_PER_OBSERVATION), 0.0, dt_s)
         stale = [i for i in self._known if self._slip.contradicted(STALE)[i]]
         if stale:
             self._known = {i: ground for i, ground in self._known.items() if i not in stale}

@@ -18,6 +18,7 @@ from terrafusion.fusion.calibration.numbers import (
     COURSE_LAG,
     GNSS_DELAY,
     NUMBERS,
+    SLIP_PER_GRADE,
     TURN_SCALE,
     TURN_SLIP_M,
     WHEEL_DELAY,
@@ -29,8 +30,8 @@ from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reducti
 from tests.fusion.calibration.nodes import fit, node_starts, refined
 
 NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
-TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.004])
-PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03, slip_time_s=300.0)
+TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0, 0.004, 0.5])
+PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03, slip_time_s=300.0, slip_per_grade=0.3)
 STEP_S = 0.1
 
 
@@ -41,8 +42,9 @@ def figure(
     slip: float = 0.0,
     seed: int = 0,
     straight: bool = False,
+    hill: float = 0.1,
 ) -> MotionSegment:
-    """Winding at changing speed; what the sensors of a robot with `numbers` measure of it."""
+    """Winding at changing speed over hills, their sine up to `hill`: what a robot with `numbers` measures."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, STEP_S)
     middle = 0.5 * (t[1:] + t[:-1])
@@ -65,8 +67,11 @@ def figure(
     fix = fix + fix_sigma_m * (rng.normal(size=len(at)) + 1j * rng.normal(size=len(at)))
     sigma = np.full(len(at), max(fix_sigma_m, 0.01))
     distance = (speed - numbers[WHEEL_DELAY] * np.gradient(speed, STEP_S)) * STEP_S / ratio
+    grade = hill * np.sin(0.11 * middle)
+    distance = distance / (1.0 - numbers[SLIP_PER_GRADE] * grade)
     first = node_starts(t, distance, float(sigma[0]))
-    return MotionSegment(t, distance, measured, stamps, fix, sigma, 0j, first)
+    climb_m = np.abs(distance) * grade
+    return MotionSegment(t, distance, measured, stamps, fix, sigma, 0j, first, None, climb_m)
 
 
 def test_derivatives_of_the_path_are_those_of_finite_differences() -> None:
@@ -119,6 +124,7 @@ def test_derivatives_of_all_rows_are_those_of_finite_differences() -> None:
 def test_without_noise_the_numbers_are_found() -> None:
     found = fit([figure(300.0)], [(0j, 0.0)], PRIOR, NOISE)
     assert np.allclose(found.mean[:6], TRUE[:6], atol=[2e-3, 2e-4, 5e-3, 0.02, 0.02, 0.02])
+    assert found.mean[SLIP_PER_GRADE] == pytest.approx(TRUE[SLIP_PER_GRADE], abs=0.02)
 
 
 @pytest.mark.parametrize("sigma_m", [0.02, 0.5])
@@ -127,9 +133,9 @@ def test_errors_are_covered_by_their_sigmas(sigma_m: float) -> None:
     for seed in range(12):
         found = fit([figure(240.0, fix_sigma_m=sigma_m, slip=0.02, seed=seed)], [(0j, 0.0)], PRIOR, NOISE)
         errors.append((found.mean - TRUE) / found.sigma)
-    square = np.mean(np.square(np.array(errors)[:, :6]))
-    assert square < 2.0, np.array(errors).round(1)
-    assert np.mean(np.abs(np.array(errors)[:, :6]) < 2.0) > 0.85
+    found = np.array(errors)[:, [*range(6), SLIP_PER_GRADE]]
+    assert np.mean(np.square(found)) < 2.0, found.round(1)
+    assert np.mean(np.abs(found) < 2.0) > 0.85
 
 
 def test_a_course_that_lags_in_turns_does_not_look_like_late_fixes() -> None:

@@ -27,9 +27,10 @@ def learned(
     place_m: complex = 0.0,
     swing_radps: float = 0.23,
     sway: float = 0.0,
+    slope: float = 0.0,
 ) -> MountingAngle:
     """After a drive at 1 m/s that swings by a third; hills add `hill` times the loss of speed, and the robot
-    sways to its left by `sway` times the gain.
+    sways to its left by `sway` times the gain. The ground rises to the east by `slope`, which comes and goes.
     """
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, seconds, DT_S)
@@ -37,11 +38,14 @@ def learned(
     gained, turn = 0.27 * np.cos(0.9 * t_s), turn_radps * np.sin(swing_radps * t_s)
     body = (1.0 - hill) * gained + 1j * speed * turn + 0.3
     body = body + 1j * sway * gained + place_m * (1j * np.gradient(turn, DT_S) - turn**2)
+    yaw = np.cumsum(turn) * DT_S - 0.5 * DT_S * turn
+    body = body + 9.81 * slope * np.sin(0.4 * t_s) * np.exp(-1j * yaw)
+    gyro = -1j * slope * 0.4 * np.cos(0.4 * t_s) * np.exp(-1j * (yaw + angle_rad))
     noise = noise_mps2 * (rng.normal(size=len(t_s)) + 1j * rng.normal(size=len(t_s)))
     read = body * cmath.exp(-1j * angle_rad) + noise
     found = MountingAngle()
-    for v, w, f in zip(speed, turn, read, strict=True):
-        found.add(DT_S, v * DT_S, w * DT_S, force(f))
+    for v, w, tilt, f in zip(speed, turn, gyro, read, strict=True):
+        found.add(DT_S, v * DT_S, np.array([tilt.real, tilt.imag, w]), force(f))
     return found
 
 
@@ -63,6 +67,12 @@ def test_an_imu_away_from_the_origin_is_not_taken_for_a_turned_one(place_m: comp
     found = learned(0.4, turn_radps=0.6, place_m=place_m, swing_radps=0.9).angle
     assert found is not None
     assert abs(found.rad - 0.4) < 0.02
+
+
+def test_gravity_on_hills_is_not_taken_for_the_robots_acceleration() -> None:
+    found = learned(2.0, slope=0.12).angle
+    assert found is not None
+    assert abs(found.rad - 2.0) < 0.02
 
 
 def test_sigma_holds_the_error_of_noisy_accelerations() -> None:
@@ -88,7 +98,7 @@ def test_errors_that_last_for_a_block_count_as_one() -> None:
         speed, turn = 1.0 + 0.3 * np.sin(0.9 * t_s), 0.5 * np.sin(0.23 * t_s)
         body = (1.0 + slip) * (0.27 * np.cos(0.9 * t_s) + 1j * speed * turn)
         for v, w, f in zip(speed, turn, body, strict=True):
-            found.add(DT_S, v * DT_S, w * DT_S, force(f))
+            found.add(DT_S, v * DT_S, np.array([0.0, 0.0, w]), force(f))
         if found.angle is not None:
             off.append(found.angle.rad / found.angle.sigma_rad)
     assert len(off) >= 20
@@ -109,7 +119,7 @@ def test_an_interruption_begins_a_new_window() -> None:
     for i in range(300):
         if i % 9 == 0:
             found.interrupt()
-        found.add(DT_S, 0.1 + 0.01 * (i % 5), 0.05 * (i % 7 - 3), force(1.0 + 0j))
+        found.add(DT_S, 0.1 + 0.01 * (i % 5), np.array([0.0, 0.0, 0.5 * (i % 7 - 3)]), force(1.0 + 0j))
     assert found.angle is None
 
 

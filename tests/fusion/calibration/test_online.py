@@ -11,7 +11,7 @@ import pytest
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import online
 from terrafusion.fusion.calibration.motion import MotionSegment
-from terrafusion.fusion.calibration.numbers import COURSE_LAG, GNSS_DELAY, NUMBERS, Knowledge
+from terrafusion.fusion.calibration.numbers import COURSE_LAG, GNSS_DELAY, NUMBERS, SLIP_PER_GRADE, Knowledge
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.twin.simulate import simulate
@@ -33,7 +33,9 @@ def driven(
         yaw += turn
         z += distance * np.exp(1j * yaw)
         course = float(drive.course_rad[i - 1]) if i and drive.course_rad is not None else 0.0
-        learning.drive(t_ns, distance, turn, np.array([z.real, z.imag]), yaw, course)
+        climb_m = float(drive.climb_m[i - 1]) if i and drive.climb_m is not None else 0.0
+        grade = climb_m / abs(distance) if distance else 0.0
+        learning.drive(t_ns, distance, turn, np.array([z.real, z.imag]), yaw, course, grade)
         while j < len(drive.fix) and drive.fix_t_s[j] <= t_s:
             fix = np.array([drive.fix[j].real, drive.fix[j].imag, 0.0])
             learning.fix(begin_ns + round(drive.fix_t_s[j] * 1e9), fix, float(drive.fix_sigma_m[j]))
@@ -47,14 +49,15 @@ def driven(
 
 def test_numbers_are_found_while_driving_and_their_sigmas_shrink() -> None:
     known = driven(figure(240.0, fix_sigma_m=0.05, slip=0.01), SelfCalibration(PRIOR, NOISE, 0j))
-    error = np.abs(known[-1].mean - TRUE)[:6]
-    assert (error < 4.0 * known[-1].sigma[:6] + [2e-3, 2e-4, 3e-3, 0.02, 0.02, 0.02]).all()
-    assert (known[-1].sigma[:6] < 0.4 * known[0].sigma[:6]).all()
+    found = [*range(6), SLIP_PER_GRADE]
+    error = np.abs(known[-1].mean - TRUE)[found]
+    assert (error < 4.0 * known[-1].sigma[found] + [2e-3, 2e-4, 3e-3, 0.02, 0.02, 0.02, 0.02]).all()
+    assert (known[-1].sigma[found] < 0.4 * known[0].sigma[found]).all()
 
 
 def test_wheels_that_are_steered_to_one_side_are_not_taken_for_a_wrong_antenna_or_delay() -> None:
     """Front and rear wheels turned alike: the robot moves aside, as it turns and changes its speed."""
-    drive = figure(240.0, 0.0 * TRUE, 0.02)
+    drive = figure(240.0, PRIOR.mean, fix_sigma_m=0.02, hill=0.0)
     course = 0.3 * np.sin(0.23 * drive.t_s[1:])
     yaw = np.cumsum(drive.turn_rad) - 0.5 * drive.turn_rad
     aside = np.cumsum(1j * np.tan(course) * drive.distance_m * np.exp(1j * yaw))
@@ -63,7 +66,9 @@ def test_wheels_that_are_steered_to_one_side_are_not_taken_for_a_wrong_antenna_o
     )
     steered = dataclasses.replace(drive, fix=drive.fix + moved, course_rad=course)
     known = driven(steered, SelfCalibration(PRIOR, NOISE, 0j))[-1]
-    assert (np.abs(known.mean) < 3.0 * known.sigma + [1e-3, 1e-4, 2e-3, 0.01, 0.01, 0.01, 0.01, 0.01]).all()
+    assert (
+        np.abs(known.mean) < 3.0 * known.sigma + [1e-3, 1e-4, 2e-3, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01]
+    ).all()
 
 
 def test_numbers_that_are_far_off_are_found_without_waiting_for_more_ground() -> None:
@@ -100,7 +105,10 @@ def test_a_wrong_heading_takes_back_its_stretch() -> None:
 
 
 def test_equal_input_gives_equal_bits() -> None:
-    runs = [driven(figure(120.0, 0.0 * TRUE, 0.3), SelfCalibration(PRIOR, NOISE, 0j)) for _ in range(2)]
+    runs = [
+        driven(figure(120.0, PRIOR.mean, fix_sigma_m=0.3, hill=0.0), SelfCalibration(PRIOR, NOISE, 0j))
+        for _ in range(2)
+    ]
     assert all(same(a.mean, b.mean) for a, b in zip(*runs, strict=True))
 
 
@@ -207,7 +215,7 @@ def step_times(drive: MotionSegment) -> tuple[list[float], list[int]]:
 
 def test_a_step_waits_for_four_nodes_four_fixes_and_four_seconds() -> None:
     """Of a robot whose numbers are as assumed: no step is far off, so that the next one waits."""
-    drive = figure(60.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    drive = figure(60.0, PRIOR.mean, fix_sigma_m=0.05, hill=0.0)
     times_s, nodes = step_times(drive)
     assert times_s[0] >= online.STEP_S
     assert nodes[0] == 4, "at once"
@@ -220,7 +228,7 @@ def test_a_step_waits_for_four_nodes_four_fixes_and_four_seconds() -> None:
 
 
 def test_a_robot_that_stands_makes_a_step_only_with_a_new_node() -> None:
-    drive = figure(120.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    drive = figure(120.0, PRIOR.mean, fix_sigma_m=0.05, hill=0.0)
     still = drive.t_s[:-1] >= 40.0
     stopped = dataclasses.replace(
         drive,
@@ -248,7 +256,7 @@ def test_a_new_stretch_begins_from_what_is_known_or_is_given() -> None:
 
 
 def test_fixes_that_no_numbers_explain_do_not_hurry_the_steps() -> None:
-    drive = figure(60.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    drive = figure(60.0, PRIOR.mean, fix_sigma_m=0.05, hill=0.0)
     scatter = np.random.default_rng(0).normal(size=(2, len(drive.fix))) * 3.0
     times_s, _ = step_times(dataclasses.replace(drive, fix=drive.fix + scatter[0] + 1j * scatter[1]))
     assert np.diff(times_s)[2:] == pytest.approx(online.STEP_S, abs=0.11)
@@ -256,7 +264,7 @@ def test_fixes_that_no_numbers_explain_do_not_hurry_the_steps() -> None:
 
 def test_new_nodes_begin_where_the_wheels_have_led() -> None:
     learning = SelfCalibration(PRIOR, NOISE, 0j)
-    drive = figure(90.0, 0.0 * TRUE, fix_sigma_m=0.05)
+    drive = figure(90.0, PRIOR.mean, fix_sigma_m=0.05, hill=0.0)
     driven(drive, learning)
     nodes = learning._nodes()
     assert len(nodes.state) > len(learning._state)

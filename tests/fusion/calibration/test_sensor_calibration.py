@@ -91,8 +91,8 @@ def test_changed_numbers_are_recovered_within_three_sigma(found: SensorCalibrati
         assert number.sigma < 0.4 * number.sigma_before, name
         assert abs(number.value - true) < 3.0 * np.hypot(number.sigma, spread), (name, number)
     assert "yaw_factor" not in found.numbers
-    assert found.unobserved() == ["course_lag_s"]  # slip in turns is larger
-    assert "not observable in these logs: course_lag_s" in found.summary()
+    assert found.unobserved() == ["course_lag_s", "slip_per_grade"]  # slip in turns is larger; no hills
+    assert "not observable in these logs: course_lag_s, slip_per_grade" in found.summary()
     seen = {name: dataclasses.replace(n, gained_nats=1.0) for name, n in found.numbers.items()}
     assert "all numbers were observed" in dataclasses.replace(found, numbers=seen).summary()
 
@@ -119,7 +119,7 @@ def test_the_file_carries_the_numbers_to_the_next_replay(
     logs: list[Recording], found: SensorCalibration, tmp_path: Path
 ) -> None:
     path = write_robot(tmp_path / "out" / "my_robot.yaml", found)
-    assert len(path.read_text().splitlines()) <= 10
+    assert len(path.read_text().splitlines()) <= 11
     robot = load_vehicle(path)
     assert robot.robot == found.known()
     assert robot.sensors.gnss.antenna_m[0] == pytest.approx(found.numbers["antenna_x_m"].value, rel=1e-5)
