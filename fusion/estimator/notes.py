@@ -109,7 +109,8 @@ def _on_times(estimator: Estimator) -> list[str]:
     """Samples that came too late or were stamped far ahead."""
     notes = []
     for channel, ahead in estimator.newest.refused.items():
-        notes.append(f"{counted(ahead, 'sample')} of {channel} left out: far ahead of IMU and wheels")
+        what = "too far from the time" if channel == "terrain" else "far ahead"
+        notes.append(f"{counted(ahead, 'sample')} of {channel} left out: {what} of IMU and wheels")
     if dropped := estimator.fixes.dropped:
         notes.append(
             f"{counted(dropped, 'GNSS fix', 'GNSS fixes')} left out: more than {JUMP_NS * 1e-9:g} s ahead of "
