@@ -70,6 +70,12 @@ def _on_fixes(gnss: GnssUpdater) -> list[str]:
         )
     if gnss.skid.refutations:
         notes.append(f"fixes showed {times(gnss.skid.refutations)} that the wheels skidded")
+    if gnss.skid.suspicions:
+        often = times(gnss.skid.suspicions)
+        notes.append(
+            f"fixes moved {often} faster than their receiver drifts, by chance or in a skid: the wheels "
+            "counted less for seconds"
+        )
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot skidded, with a friction limit of {friction.mps2:.1f} m/s2")
