@@ -81,6 +81,7 @@ class Estimator:
     Samples may come late and out of order (see `sample_stream`); keyframes are made as soon as the IMU
     and the wheels (or their waiting time) cover them. `on_state` is called with every new `State`,
     `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
+    Calls of several threads need one lock around each.
     """
 
     def __init__(
