@@ -10,12 +10,13 @@ from terrafusion.datasets.core.frames import matrix_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.model.ground import patch_share
-from terrafusion.twin.model.library import assumed
+from terrafusion.twin.model.library import assumed, assumed_soil
 from terrafusion.twin.model.motion import BodyMotion, wheel_shares
 from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.model.vehicle_file import read_vehicle
 from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.run_setup import RunSetup
-from terrafusion.twin.scenario.commands import DrivenStates
+from terrafusion.twin.scenario.commands import STANDING_MPS, DrivenStates
 from terrafusion.twin.sensors.drive import motor_channel, steering_channel, wheels_channel
 from terrafusion.twin.sensors.effects import with_sensor_effects
 from terrafusion.twin.sensors.environment import barometer_channel, magnetometer_channel
@@ -99,7 +100,9 @@ def _description(setup: RunSetup, noise: NoiseStreams) -> str:
 
 
 def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | VehicleParams) -> list[str]:
-    """Sensors slower than declared, when the robot would tip over, and how many numbers are assumed."""
+    """Sensors slower than declared, when the robot would tip over, commands that its drive cannot follow, and
+    how many numbers are assumed.
+    """
     sensors = setup.vehicle.sensors
     imu_hz = sensors.imu.rate_hz
     notes = [
@@ -115,10 +118,18 @@ def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | Vehicle
             f"from {motion.t_s[tipped[0]]:.1f} s on the robot would tip over: a wheel carries no load, "
             "and the model keeps it down"
         )
-    parts = [("terrain", "soils", name) for name in _terrains(setup)]
+    if setup.vehicle.steered() is not None and setup.scenario.drive:
+        sent = setup.scenario.commanded(motion.t_s)
+        turning = (np.abs(sent[:, 0]) < STANDING_MPS) & (sent[:, 1] != 0.0)
+        if turning.any():
+            seconds = turning.mean() * motion.t_s[-1]
+            notes.append(
+                f"turns on the spot, {seconds:.1f} s of the commands, are not driven: "
+                f"'{setup.vehicle.name}' steers its wheels"
+            )
+    counts = {("terrain", name): assumed_soil(name) for name in _terrains(setup)}
     if not isinstance(vehicle, VehicleParams):
-        parts.insert(0, ("vehicle", "vehicles", str(vehicle)))
-    counts = {(kind, name): assumed(folder, name) for kind, folder, name in parts}
+        counts = {("vehicle", str(vehicle)): assumed(read_vehicle(vehicle)[0]), **counts}
     listed = [f"{n} of {whole} of {kind} '{name}'" for (kind, name), (n, whole) in counts.items() if n]
     if listed:
         notes.append(f"assumed numbers, marked in their files: {', '.join(listed)}")

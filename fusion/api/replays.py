@@ -42,21 +42,13 @@ class Replay(ReplayResult):
         return Path(out) / "report.html"
 
     def __repr__(self) -> str:
-        scores = self.scores
         lines = [
             *self.verdict.lines()[:3],
             f"Replay of '{self.recording.name}' ({self.vehicle.name}, {self.mode}), "
             f"{self.recording.duration_s():.1f} s at {self.realtime_factor():.0f} x real time",
         ]
-        if scores.ate_m is not None:
-            lines.append(f"  position error against {scores.against}: {scores.ate_m:.3f} m (RMS)")
-        if scores.held_out is not None:
-            held = scores.held_out
-            lines.append(f"  {held.fixes} fixes held out: median error {held.median_m:.2f} m")
-        for outage in scores.outages[:4]:
-            end = "not scored" if outage.end_error_m is None else f"{outage.end_error_m:.2f} m at its end"
-            lines.append(f"  outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: {end}")
-        return "\n".join([*lines, *(f"  {line}" for line in repr(self.estimate).splitlines())])
+        below = [*self.scores.lines(), *repr(self.estimate).splitlines()]
+        return "\n".join([*lines, *(f"  {line}" for line in below)])
 
     def _repr_html_(self) -> str:
         return text_html(repr(self))

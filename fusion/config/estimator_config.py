@@ -116,6 +116,17 @@ class EstimatorConfig:
     grounds: GroundMemory | None = None
     terrain_model: TerrainModel | None = None
 
+    def __repr__(self) -> str:
+        inputs = [
+            key if value is True else f"{key} {value}" for key, value in vars(self.inputs).items() if value
+        ]
+        vehicle = self.vehicle or "unnamed vehicle"
+        return (
+            f"EstimatorConfig ({vehicle}, {self.mode}, policy '{self.policy.name}')\n"
+            f"  a keyframe every {self.keyframe_s:g} s, lag {self.lag_s:g} s\n"
+            f"  sensors: {', '.join(inputs)}"
+        )
+
     def __post_init__(self) -> None:
         for key, kind, what, remedy in _KINDS:
             value = getattr(self, key)

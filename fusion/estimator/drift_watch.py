@@ -27,10 +27,13 @@ from terrafusion.fusion.noise.policy import SensorNoise
 
 WINDOW_S = 5.0
 """Over which a move is judged: a skid lasts a second or two, the smoothing window is as long (assumed)."""
+SPACING_S = 0.75
+"""Least time between estimates that are compared: each is another chance of a false alarm, and `LIMIT` is for
+one a second. A receiver at 1 Hz may be a little early."""
 LIMIT = 2.0 * float(gammaincinv(1.0, 0.95))
 """Of the normalised square: 95 % of chi-square with two degrees of freedom. The covariance taken is an upper
-bound: beside wheels that lose .1 m/sqrt(s) a receiver passes it in one of ten drives of two minutes. The
-wheels then count less for some seconds."""
+bound: beside wheels that lose .1 m/sqrt(s) a receiver passes it in one of ten drives of two minutes, at 5 Hz
+in one of five. The wheels then count less for some seconds."""
 MOST_YAW_RAD = 0.15
 """Sigma of the heading beyond which it, not the wheels, may have led astray (assumed)."""
 LEAST_SHARE = 0.5
@@ -132,6 +135,8 @@ class DriftWatch:
         None where it did not.
         """
         self.seen = [one for one in self.seen if 0 < now.t_ns - one.t_ns <= WINDOW_S * 1e9]
+        if self.seen and now.t_ns - self.seen[-1].t_ns < SPACING_S * 1e9:
+            return None
         found = None
         for before in self.seen:
             (x_m, y_m), expected_m2, new_m2 = self._move(before, now)

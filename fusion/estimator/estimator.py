@@ -54,6 +54,7 @@ from terrafusion.fusion.graph.factors import imu_factor
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import level_factor, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
+from terrafusion.fusion.inputs.sample_stream import MOST_LATE_S
 from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream, forget_in_pause, usual_interval_s
 from terrafusion.fusion.inputs.time_jumps import EarlyFixes, Newest
@@ -80,6 +81,7 @@ class Estimator:
     Samples may come late and out of order (see `sample_stream`); keyframes are made as soon as the IMU
     and the wheels (or their waiting time) cover them. `on_state` is called with every new `State`,
     `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
+    Calls of several threads need one lock around each.
     """
 
     def __init__(
@@ -216,7 +218,7 @@ class Estimator:
 
     def add_terrain(self, t_ns: Stamp, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with those of the detector."""
-        if (t := self.newest.admitted(t_ns, "terrain")) is not None:
+        if (t := self.newest.admitted(t_ns, "terrain", round(MOST_LATE_S * 1e9))) is not None:
             self.weights.external(t, probabilities)
 
     def add_command(self, t_ns: Stamp, v_mps: float) -> None:

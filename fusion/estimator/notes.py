@@ -70,6 +70,12 @@ def _on_fixes(gnss: GnssUpdater) -> list[str]:
         )
     if gnss.skid.refutations:
         notes.append(f"fixes showed {times(gnss.skid.refutations)} that the wheels skidded")
+    if gnss.skid.suspicions:
+        often = times(gnss.skid.suspicions)
+        notes.append(
+            f"fixes moved {often} faster than their receiver drifts, by chance or in a skid: the wheels "
+            "counted less for seconds"
+        )
     friction = gnss.skid.friction
     if friction is not None and friction.leads:
         notes.append(f"at its end the robot skidded, with a friction limit of {friction.mps2:.1f} m/s2")
@@ -109,7 +115,8 @@ def _on_times(estimator: Estimator) -> list[str]:
     """Samples that came too late or were stamped far ahead."""
     notes = []
     for channel, ahead in estimator.newest.refused.items():
-        notes.append(f"{counted(ahead, 'sample')} of {channel} left out: far ahead of IMU and wheels")
+        what = "too far from the time" if channel == "terrain" else "far ahead"
+        notes.append(f"{counted(ahead, 'sample')} of {channel} left out: {what} of IMU and wheels")
     if dropped := estimator.fixes.dropped:
         notes.append(
             f"{counted(dropped, 'GNSS fix', 'GNSS fixes')} left out: more than {JUMP_NS * 1e-9:g} s ahead of "

@@ -53,14 +53,15 @@ class SkidDetector:
     Attributes:
         friction: friction estimator, where there is one.
         rate_m2ps: variance of the wheels' displacement, each axis, per second of driving.
-        refutations: how often fixes refuted the wheels.
+        refutations: how often rejected fixes refuted the wheels.
+        suspicions: how often the drift of accepted fixes did; some by chance, on any ground.
         by_rejection: whether one of them, in the skid under way, was by fixes that the gate rejected.
     """
 
     def __init__(self, friction: FrictionEstimator | None = None) -> None:
         self.friction = friction
         self.rate_m2ps = 0.0
-        self.refutations = 0
+        self.refutations = self.suspicions = 0
         self.by_rejection = False
         self._before: tuple[float, bool, list[_Passed]] = (0.0, False, [])
         self._driven_s = 0.0
@@ -120,7 +121,8 @@ class SkidDetector:
         unaided_s = (chain.node(k).t_ns - since_ns) * 1e-9
         share = driven_s * SLIDE_S / unaided_s**2 if unaided_s > UNAIDED_S else 1.0
         self.rate_m2ps += share * more_m2ps
-        self.refutations += 1
+        self.refutations += rejected
+        self.suspicions += not rejected
         # Over all of the time: wheels that are locked do not say when a robot stops.
         m2ps = float(more_m2ps * driven_s / max(seconds, 1e-9))
         for i, (dt_s, node) in enumerate(steps, begin + 1):

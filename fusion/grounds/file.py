@@ -42,6 +42,7 @@ class GroundFile:
     evidence: Annotated[float, Quantity("", -1e3, 1e3)] = 0.0
     first: str = ""
     last: str = ""
+    origin: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,7 @@ def _ground(content: GroundFile) -> Ground:
         content.friction_windows,
         content.first,
         content.last,
+        content.origin,
     )
 
 
@@ -127,6 +129,7 @@ def _written(ground: Ground) -> dict[str, object]:
         "friction_windows": _rounded(ground.friction_windows),
         "first": ground.first,
         "last": ground.last,
+        **({"origin": ground.origin} if ground.origin else {}),
     }
 
 

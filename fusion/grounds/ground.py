@@ -73,6 +73,7 @@ class Ground:
         friction: (10,) probabilities of the friction limits of `estimator.friction` and of rolling.
         friction_windows: windows that gave them.
         first, last: dates (YYYY-MM-DD) of the first and the last drive on it, "" where not known.
+        origin: mark of the windows by which it was found; "" where not known.
     """
 
     name: str
@@ -82,12 +83,13 @@ class Ground:
     friction_windows: float = 0.0
     first: str = ""
     last: str = ""
+    origin: str = ""
 
     @classmethod
-    def new(cls, name: str) -> "Ground":
+    def new(cls, name: str, origin: str = "") -> "Ground":
         """Nothing is known of it."""
         even = np.full(FRICTION_MODELS, 1.0 / FRICTION_MODELS)
-        return cls(name, Tally.empty(len(SIGNATURE)), Tally.empty(2), even)
+        return cls(name, Tally.empty(len(SIGNATURE)), Tally.empty(2), even, origin=origin)
 
     @property
     def windows(self) -> float:
@@ -123,11 +125,11 @@ class Ground:
         return dataclasses.replace(self, friction=mean, friction_windows=n)
 
     def same_as(self, other: "Ground") -> bool:
-        """Whether both hold the same numbers, by whatever name."""
+        """Whether both are one ground at different times, or hold the same numbers, by whatever name."""
         mine, others = (
             [*vars(g.signature).values(), *vars(g.motion).values(), g.friction] for g in (self, other)
         )
-        return all(map(np.array_equal, mine, others))
+        return (self.origin == other.origin != "") or all(map(np.array_equal, mine, others))
 
     def merged(self, other: "Ground") -> "Ground":
         """This ground with what `other` knows of the same one."""
@@ -143,6 +145,7 @@ class Ground:
             windows,
             min(dates, default=""),
             max(dates, default=""),
+            self.origin or other.origin,
         )
 
 

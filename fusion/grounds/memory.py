@@ -6,6 +6,7 @@ that came to look alike are merged.
 """
 
 import dataclasses
+import hashlib
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -145,7 +146,8 @@ class GroundMemory:
     def _found(self, date: str) -> None:
         names = {g.name for g in self.grounds}
         name = next(f"ground {i}" for i in range(1, MOST_GROUNDS + 2) if f"ground {i}" not in names)
-        ground = Ground.new(name)
+        origin = hashlib.sha256(np.array(self._waiting).tobytes()).hexdigest()[:16]
+        ground = Ground.new(name, origin)
         for signature in self._waiting:
             ground = ground.seen(signature, 1.0, date)
         self._waiting.clear()
@@ -182,14 +184,18 @@ class GroundMemory:
 def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
     """The grounds of several robots of one type as one memory; those that look alike become one.
 
-    What is there twice, as in a memory given twice, counts once.
+    What is there twice counts once: a memory given twice, or one of Monday beside that of Tuesday, which
+    began with it.
     """
     found = list(memories)
     grounds: list[Ground] = []
     names = set[str]()
     for memory in found:
         for ground in memory.grounds:
-            if any(ground.same_as(other) for other in grounds):
+            same = next((i for i, other in enumerate(grounds) if ground.same_as(other)), None)
+            if same is not None:
+                if ground.windows > grounds[same].windows:
+                    grounds[same] = dataclasses.replace(ground, name=grounds[same].name)
                 continue
             name, i = ground.name, 1
             while name in names and name.startswith("ground "):

@@ -5,6 +5,7 @@ decide between a pause and a wrong clock.
 """
 
 import itertools
+import math
 import statistics
 from collections import deque
 from collections.abc import Iterable
@@ -43,7 +44,7 @@ class Newest:
     """Time of the newest sample of IMU and wheels; None before the first.
 
     Attributes:
-        refused: by channel, the number of samples far ahead of it.
+        refused: by channel, the number of samples far ahead of it, or too old.
         steps_ns: the last steps of time.
         used_count: number of samples that are used.
         fixes_ns: times of the last fixes, as they came; `fix_count` counts all.
@@ -87,14 +88,15 @@ class Newest:
         wait_ns = FIX_STEPS * median_step_ns(self.fixes_ns)
         return wait_ns if 0 < wait_ns <= LONGEST_FIX_WAIT_NS else 0
 
-    def admitted(self, t_ns: Any, channel: str) -> int | None:
-        """The time of a sample of another channel, ns; None, and counted, where it lies far ahead.
+    def admitted(self, t_ns: Any, channel: str, oldest_ns: float = math.inf) -> int | None:
+        """The time of a sample of another channel, ns; None, and counted, where it lies far ahead, or further
+        behind than `oldest_ns`.
 
         Raises:
             DataError: the time is none.
         """
         t_ns = checked_time(t_ns, channel)
-        if self.t_ns is None or t_ns - self.t_ns <= LONGEST_JUMP_NS:
+        if self.t_ns is None or -oldest_ns <= t_ns - self.t_ns <= LONGEST_JUMP_NS:
             return t_ns
         self.refused[channel] = self.refused.get(channel, 0) + 1
         return None

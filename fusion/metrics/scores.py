@@ -119,6 +119,22 @@ class Scores:
     errors: Errors | None = field(default=None, repr=False)
     consistency: tuple[Consistency, ...] = ()
 
+    def __repr__(self) -> str:
+        return "\n".join(["Scores", *(f"  {line}" for line in self.lines() or ["no reference"])])
+
+    def lines(self) -> list[str]:
+        """Error, fixes held out and the first outages, in words."""
+        lines = []
+        if self.ate_m is not None:
+            lines.append(f"position error against {self.against}: {self.ate_m:.3f} m (RMS)")
+        if self.held_out is not None:
+            held = self.held_out
+            lines.append(f"{held.fixes} fixes held out: median error {held.median_m:.2f} m")
+        for outage in self.outages[:4]:
+            end = "not scored" if outage.end_error_m is None else f"{outage.end_error_m:.2f} m at its end"
+            lines.append(f"outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: {end}")
+        return lines
+
 
 def parse_outage(text: str) -> Outage:
     """`START:SECONDS`, both in seconds, as in "120:60".

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import quantities, structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import read_yaml
 
@@ -89,6 +90,15 @@ class Policy:
     fixed: SensorNoise
     inputs_sha256: str
     name: str = "policy"
+
+    def __repr__(self) -> str:
+        """A line a class, of at most ten."""
+        rows = [
+            f"  {name}: slip {noise.slip_mean:.3f} +- {noise.slip_sigma:.2g}, "
+            f"side-slip +- {noise.side_slip_sigma:.2g}"
+            for name, noise in [("fixed", self.fixed), *self.classes.items()][:11]
+        ]
+        return "\n".join([f"Policy '{self.name}', {counted(len(self.classes), 'class', 'classes')}", *rows])
 
     def names(self) -> tuple[str, ...]:
         """Class names in the file's order; probabilities are given in this order."""

@@ -161,6 +161,15 @@ def test_what_is_assumed_is_noted() -> None:
     assert not any("vehicle" in note for note in simulate("straight", vehicle=ELEVATE).notes)
 
 
+def test_a_short_file_of_a_steered_robot_tells_what_it_assumes_and_cannot_drive(tmp_path) -> None:
+    own = tmp_path / "car.yaml"
+    own.write_text("robot: {extends: generic, name: car, drive: ackermann}\n")
+    turns, numbers = simulate("spin", vehicle=own, terrain="asphalt").notes
+    assert turns == "turns on the spot, 50.0 s of the commands, are not driven: 'car' steers its wheels"
+    assert "of vehicle" in numbers
+    assert len(simulate("circle", vehicle=own, terrain="asphalt").notes) == 1
+
+
 def test_zones_count_by_time_or_by_travel() -> None:
     t, travel = np.array([0.0, 5.0, 10.0]), np.array([0.0, 1.0, 2.0])
     assert inside(Interval(5.0, 5.0), t, travel).tolist() == [False, True, False]

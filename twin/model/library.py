@@ -53,15 +53,18 @@ def _own_file(folder: str, name: str) -> dict[str, Any]:
     return read_yaml(PARAMS / folder / f"{name}.yaml")
 
 
-def assumed(folder: str, name_or_path: str | Path) -> tuple[int, int]:
-    """How many numbers of a file are assumed by their sources, and how many it has; (0, 0) for no file."""
+def assumed_soil(name_or_path: str | Path) -> tuple[int, int]:
+    """As `assumed`, of a soil's file; (0, 0) for no file."""
     try:
-        if folder == "soils" and is_published(str(name_or_path)):
-            raw = published_soil(str(name_or_path))
-        else:
-            raw, _ = read_named(folder, name_or_path, kind="file")
+        if is_published(str(name_or_path)):
+            return assumed(published_soil(str(name_or_path)))
+        return assumed(read_named("soils", name_or_path, kind="soil")[0])
     except ConfigError:
         return 0, 0
+
+
+def assumed(raw: dict[str, Any]) -> tuple[int, int]:
+    """How many numbers of a file's content are assumed by their sources, and how many it has."""
     sources = list(_sources(raw))
     return sum(source.startswith("assumed") for source in sources), len(sources)
 

@@ -84,7 +84,9 @@ def test_what_is_shown_is_short(log: tf.Recording, result: tf.Replay) -> None:
         assert 1 <= len(repr(shown).splitlines()) <= 12
         assert "<" in shown._repr_html_()
     fit = tf.calibrate(log, parameters="vehicle.wheel.radius_m")
-    for plain in (log.imu, log.wheels, log.gnss, log.truth, fit):
+    config = tf.Estimator.for_vehicle("elevate").config
+    assert "sensors: imu six_axis, sides, gnss" in repr(config)
+    for plain in (log.imu, log.wheels, log.gnss, log.truth, fit, config, tf.policy.load(), result.scores):
         assert 1 <= len(repr(plain).splitlines()) <= 12
         assert len(repr(plain)) < 600
 

@@ -118,6 +118,7 @@ def test_two_fixes_that_the_rate_explains_free_the_velocity_alone() -> None:
 def test_a_skid_by_the_drift_alone_is_not_one_by_rejected_fixes() -> None:
     slide, moved_m = SkidDetector(), [np.array([1.0, 0.0])] * 2
     assert slide.test_wheels(Recorder(), 10, 3 * S, moved_m, 0.1, NOISE, rejected=False)  # type: ignore[arg-type]
+    assert (slide.refutations, slide.suspicions) == (0, 1)
     assert slide.rate_m2ps > 0.0
     assert not slide.by_rejection
     assert refuted(Recorder(), slide, [(2.0, 0.0), (3.0, 0.0)])

@@ -151,6 +151,16 @@ def test_a_memory_given_twice_counts_once() -> None:
     assert [g.windows for g in both.grounds] == sorted((g.windows for g in one.grounds), reverse=True)
 
 
+def test_a_memory_beside_the_one_it_began_counts_once(tmp_path: Path) -> None:
+    monday, path = two_grounds(1), tmp_path / "grounds.yaml"
+    save_grounds(monday, path)
+    tuesday, rng = load_grounds(path), np.random.default_rng(9)
+    tuesday.grounds = [g.seen(signature(SMOOTH, rng), 1.0, "") for g in tuesday.grounds]
+    for given in ([monday, tuesday], [tuesday, monday]):
+        windows = [g.windows for g in merged(given).grounds]
+        assert windows == sorted((g.windows for g in tuesday.grounds), reverse=True)
+
+
 def test_a_full_memory_counts_what_it_leaves_out() -> None:
     rng, memory = np.random.default_rng(5), GroundMemory()
     for i in range(MOST_GROUNDS):

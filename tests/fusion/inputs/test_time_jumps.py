@@ -90,6 +90,8 @@ def test_other_channels_are_refused_ten_seconds_ahead() -> None:
     assert [newest.admitted(NOW + 10 * S + k, "terrain") for k in (1, 2)] == [None, None]
     assert newest.refused == {"terrain": 2}
     assert Newest().admitted(10**18, "terrain") == 10**18
+    assert [newest.admitted(NOW - k * S, "terrain", 5 * S) for k in (5, 6)] == [NOW - 5 * S, None]
+    assert newest.refused == {"terrain": 3}
     with pytest.raises(DataError, match="no integer"):
         newest.admitted(1.5, "terrain")
 

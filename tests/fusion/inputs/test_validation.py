@@ -359,6 +359,18 @@ def test_what_names_no_grounds_is_a_data_error(running: Running, probabilities: 
         running.again().add_terrain(running.now_ns, probabilities)
 
 
+def test_pictures_of_ground_passed_seconds_ago_are_left_out(running: Running) -> None:
+    """A network that was down passes on what it held."""
+    estimator = running.again()
+    before = estimator.weights.posterior()
+    for k in range(30):
+        estimator.add_terrain(running.now_ns - (40 - k) * 10**9, {"mud": 1.0})
+    assert estimator.weights.posterior() == before
+    assert "30 samples of terrain left out: too far from the time of IMU and wheels" in notes_of(estimator)
+    estimator.add_terrain(running.now_ns - 10**9, {"mud": 1.0})
+    assert estimator.weights.posterior() != before
+
+
 @pytest.mark.parametrize("at", [0.02, 0.9])
 @pytest.mark.parametrize("off_m", [1e8, -3000.0])
 def test_counters_that_are_reset_or_leap_cost_nothing(at: float, off_m: float) -> None:
