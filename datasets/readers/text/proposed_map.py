@@ -10,7 +10,14 @@ import numpy as np
 from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, VARIANCE, YAW_RATE, units_of
+from terrafusion.datasets.readers.text.column_map import (
+    DDMM,
+    FIELDS,
+    TEXT_FIELDS,
+    VARIANCE,
+    YAW_RATE,
+    units_of,
+)
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
@@ -114,6 +121,9 @@ _MESSAGE = re.compile(
 """Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_HEMISPHERES = {"latitude_deg": ("N", "S"), "longitude_deg": ("E", "W")}
+_NMEA_PLACE = re.compile(r"-?\d{4,5}\.\d+")
+"""A latitude or longitude in degrees and minutes; with zeros in front of small ones."""
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
@@ -141,9 +151,12 @@ class _Header:
     sensor: str
 
 
-def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
-    """A first column map, on one line, for the user to correct; the first row's cells tell units."""
+def starter_map(names: Sequence[str], first: Sequence[str] = (), units: Sequence[str] = ()) -> str:
+    """A first column map, on one line, for the user to correct; the first row's cells tell units, as do those
+    of a line of `units` below the header."""
     headers = [_header(name) for name in names]
+    for k, (header, unit) in enumerate(zip(headers, units, strict=False)):
+        headers[k] = header if header.unit else replace(_header(f"{header.column} [{unit}]"), column=names[k])
     cells = dict(zip(names, first, strict=False))
     times = [h for h in headers if _TIME.search(h.base)]
     of_day = [h for h in times if _cell_of_day(h, cells)]
@@ -155,7 +168,8 @@ def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
             continue
         for channel, field in _guesses(header):
             if field not in channels.get(channel, {}):
-                channels.setdefault(channel, {})[field] = _entry(header, field)
+                place = _place_entry(header, cells, field) if field in _HEMISPHERES else ""
+                channels.setdefault(channel, {})[field] = place or _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
     sections = ", ".join(
         f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
@@ -252,6 +266,17 @@ def _entry(header: _Header, field: str) -> str:
     return f"{{column: {name}, unit: {header.unit}}}"
 
 
+def _place_entry(header: _Header, cells: Mapping[str, str], field: str) -> str:
+    """The entry of a latitude or longitude beside a column of its hemisphere, or as NMEA writes it; "" for
+    another."""
+    beside = [name for name, cell in cells.items() if cell.strip() in _HEMISPHERES[field]]
+    unit = DDMM if _NMEA_PLACE.fullmatch(cells.get(header.column, "").strip()) else header.unit
+    parts = [("column", header.column), *([("unit", unit)] if unit else [])]
+    parts += [("hemisphere", name) for name in beside[:1]]
+    written = (f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in parts)
+    return f"{{{', '.join(written)}}}" if beside or unit == DDMM else ""
+
+
 def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     """The channels without fields that cannot stand alone, and of wheels the best layout only."""
     found = {channel: dict(fields) for channel, fields in channels.items()}
@@ -305,7 +330,7 @@ def _time_entry(time: _Header, cell: str, rest: str, day: str) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
     since = f", epoch: {json.dumps(day)}" if day else ""
-    value = number_in(cell.replace(",", "."))
+    value = number_in(cell.removesuffix(" sec").replace(",", "."))
     if value is None and cell.strip():
         return f"{{column: {name}, unit: iso8601{since}}}"
     if value is None:

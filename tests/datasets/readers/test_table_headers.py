@@ -7,6 +7,7 @@ import pytest
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.text.proposed_map import starter_map
 from tests.datasets.readers.test_table import GYRO_MAP, table
@@ -99,6 +100,43 @@ def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
     path.write_text("t_s,speed_mps\n0,1\n", encoding="utf-16")
     with pytest.raises(DataError, match=r"excel\.csv: is text in UTF-16; save it as UTF-8"):
         open_recording(path)
+
+
+def proposed(folder: Path, text: str) -> Recording:
+    path = table(folder, text, None)
+    with pytest.raises(DataError) as told:
+        open_recording(path)
+    path.with_name("drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    return open_recording(path)
+
+
+def test_a_line_of_units_below_the_header_is_proposed(tmp_path: Path) -> None:
+    rows = "0 sec,90,7.2,--\n0.5 sec,N/A,null,1\n"
+    recording = proposed(tmp_path, f"Time,GyroZ,Speed,AccZ\n[s],[deg/s],km/h,[g]\n\n{rows}")
+    assert recording.imu is not None
+    assert recording.wheels is not None
+    np.testing.assert_allclose(recording.imu.gyro_radps[:, 2], [np.pi / 2, np.nan])
+    np.testing.assert_array_equal(recording.imu.accel_mps2[:, 2], [np.nan, 9.80665])
+    assert recording.wheels.speed.tolist() == [[2.0]]
+    assert "the line below the header holds units; left out" in recording.notes
+
+
+@pytest.mark.parametrize(("lat", "lon"), [("4807.5,S", "01130.0,W"), ("48.125,S", "11.5,W")])
+def test_hemispheres_and_degrees_with_minutes_are_proposed(lat: str, lon: str, tmp_path: Path) -> None:
+    text = f"t,Lat,NS,Lon,EW,gz\n0,,,,,1\n1,{lat},{lon},1\n2,{lat},{lon},1\n"
+    recording = proposed(tmp_path, text)
+    assert recording.datum is not None
+    assert recording.datum[:2] == (-48.125, -11.5)
+    assert recording.gnss is not None
+    assert len(recording.gnss) == 2
+    (tmp_path / "drive.csv").write_text(text.replace(",W,", ",X,"))
+    with pytest.raises(DataError, match="column 'EW' is 'X'; give N, S, E or W"):
+        open_recording(tmp_path / "drive.csv")
+
+
+def test_minutes_are_below_sixty(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"column 'Lat' is 4877\.5: no minutes"):
+        proposed(tmp_path, "t,Lat,Lon,gz\n1,4807.5,01130.0,1\n2,4877.5,01130.0,1\n")
 
 
 @pytest.mark.parametrize("names", ["t,left,right", "t,left_wheel,right_wheel", "t;wheel_l;wheel_r"])
