@@ -18,6 +18,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import UP_FACTOR
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.delimited import MISSING, head_lines, number_in, separator_of, split
@@ -100,7 +101,7 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     names, first = columns.names, columns.first_cells()
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
-    proposal = starter_map(names, first, columns.units)
+    proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)
     if names == numbered(len(names)):
         proposal = f"header: none, {proposal}"
         given = f"{', '.join(names)} (first row: {', '.join(first)})"
@@ -291,11 +292,14 @@ class _Reader(ChannelReader):
             if (a in table.numbers) != (b in table.numbers):
                 raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
         local = "latitude_deg" not in table.numbers
+        sigma = table.stack(GNSS_SIGMA)
+        if "sigma_e_m" in table.numbers and "sigma_u_m" not in table.numbers:
+            sigma[:, 2] = UP_FACTOR * sigma[:, :2].max(axis=1)
         fixes = Fixes(
             self._t(table),
             table.stack(("east_m", "north_m", "up_m") if local else GEODETIC),
             self._fix(table),
-            table.stack(GNSS_SIGMA),
+            sigma,
             table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None,
             table.numbers.get("sigma_v_mps"),
             local,

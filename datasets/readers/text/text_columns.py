@@ -70,6 +70,13 @@ class TextColumns:
         columns = range(len(self.names)) if rows else ()
         return [next((r[k] for r in rows if k < len(r) and r[k] not in MISSING), "") for k in columns]
 
+    def step(self, name: str) -> float:
+        """Median step of a column over the first rows; 0 where it holds no numbers."""
+        k = self.names.index(name)
+        cells = [number_in(row[k]) for row in _sample(self._text, self._layout) if len(row) > k]
+        values = [cell for cell in cells if cell is not None]
+        return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
         if name in self._table.texts:
@@ -197,6 +204,10 @@ class ParquetColumns:
     def first_cells(self) -> list[str]:
         """None: the kinds of the columns say what they hold."""
         return []
+
+    def step(self, name: str) -> float:
+        """0: the kinds of the columns say what they hold."""
+        return 0.0
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""
