@@ -345,6 +345,8 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
     one = {name: wheels[name] for name in ("speed_mps", YAW_RATE) if "speed_mps" in wheels and name in wheels}
     found["wheels"] = {name: wheels[name] for name in layout} or one
+    if YAW_RATE in found["wheels"] and '"x"' in found.get("truth", {}).get("x_m", "").lower():
+        del found["truth"]  # of the odometry that gives the speeds
     return {channel: fields for channel, fields in found.items() if fields}
 
 

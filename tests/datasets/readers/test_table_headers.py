@@ -173,6 +173,12 @@ AS_EXPORTED = {
         "1600000000000000000,1,0,11,48\n1600000001000000000,1,0,11,48",
         'unit: ns, epoch: unix}, channels: {gnss: {longitude_deg: "longitude", latitude_deg: "latitude"}}',
     ),
+    "odometry, whose place is no truth": (
+        "odometry.csv",
+        "time,x,y,theta,v,w",
+        "0.1,1,2,0,1,0.1\n0.2,1,2,0,1,0.1",
+        'channels: {wheels: {speed_mps: "v", yaw_rate_radps: "w"}}',
+    ),
     "Arduino": (
         "log.csv",
         "millis,v_left,v_right",
