@@ -203,8 +203,8 @@ def fix_sigmas(stream: Stream) -> Array:
 
 
 def fix_velocities(stream: Stream) -> tuple[Array | None, Array | None]:
-    """ENU velocities (N, 3) m/s of GPSFix and their sigmas (N,); None of other fixes, and where drivers leave
-    the speed at zero."""
+    """ENU velocities (N, 3) m/s of GPSFix and their sigmas (N,), NaN where the driver leaves the speed at
+    zero; None where all are, and of other fixes."""
     speed = stream.column("speed").astype(float) if stream.has("speed") else np.zeros(0)
     if not np.nan_to_num(speed).any():
         return None, None
@@ -212,7 +212,8 @@ def fix_velocities(stream: Stream) -> tuple[Array | None, Array | None]:
     east, north = speed * np.sin(np.radians(track)), speed * np.cos(np.radians(track))
     up = climb if np.nan_to_num(climb).any() else np.full(len(climb), np.nan)
     sigma = np.where(within > 0.0, within, np.nan) / SIGMAS_IN_95
-    return np.stack([east, north, up], axis=1), None if np.isnan(sigma).all() else sigma
+    velocity = np.where(speed[:, None] != 0.0, np.stack([east, north, up], axis=1), np.nan)
+    return velocity, None if np.isnan(sigma).all() else sigma
 
 
 def twists(stream: Stream) -> tuple[Array, Array]:

@@ -195,7 +195,7 @@ def test_fixes_with_speed_and_track_are_read(kind: str, tmp_path: Path) -> None:
     for k, t in enumerate(TIMES):
         seen, header = np.arange(k % 3, dtype=np.int32), make.header(t, "gps")
         about = make.new(status, header, 1, seen, 2, seen, seen, seen, seen, 20, 1, 1, 1)
-        numbers = [48.0, 11.0 + 1e-5 * k, 500.0, 90.0, 1.5, 0.0, *np.zeros(13), 0.392, *np.zeros(5)]
+        numbers = [48.0, 11.0 + 1e-5 * k, 500.0, 90.0, 1.5 * (k > 0), 0.0, *np.zeros(13), 0.392, *np.zeros(5)]
         covariance = np.diag([0.25, 0.36, 4.0]).ravel()
         messages.append(("/gps", fix, t, make.new(fix, header, about, *numbers, covariance, 2)))
     bag = (write_ros1 if kind == "ROS 1" else write_ros2)(
@@ -209,7 +209,8 @@ def test_fixes_with_speed_and_track_are_read(kind: str, tmp_path: Path) -> None:
     assert gnss is not None
     assert gnss.velocity_enu_mps is not None
     assert gnss.sigma_v_mps is not None
-    np.testing.assert_allclose(gnss.velocity_enu_mps[:, :2], [[1.5, 0.0]] * len(TIMES), atol=1e-12)
+    np.testing.assert_allclose(gnss.velocity_enu_mps[1:, :2], [[1.5, 0.0]] * (len(TIMES) - 1), atol=1e-12)
+    assert np.isnan(gnss.velocity_enu_mps[0]).all()  # live, nothing tells rest from a speed that is not set
     np.testing.assert_allclose(gnss.sigma_v_mps, 0.2)
     np.testing.assert_allclose(gnss.sigma_enu_m, [[0.5, 0.6, 2.0]] * len(TIMES))
     assert set(gnss.fix.tolist()) == {Fix.FLOAT}
