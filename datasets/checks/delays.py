@@ -1,4 +1,4 @@
-"""Clocks compared with each other: gaps, jumps, drifts, and constant delays between sensors."""
+"""Clocks compared with each other: gaps, jumps, and constant delays between sensors."""
 
 import dataclasses
 import functools
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.checks import motion
+from terrafusion.datasets.checks.drifts import LEAST_LAG_S, clock_drifts, drift_finding
 from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, period_s, retiming
 from terrafusion.datasets.checks.known_delays import (
     interval_with_sigma,
@@ -26,9 +27,6 @@ from terrafusion.datasets.core.recording import Recording
 LEAST_JUMP_S, JUMP_PERIODS, MOST_JUMPS = 0.3, 3.0, 4
 SURE_JUMP_S = 1.0
 """A jump that no correlation confirms must be this long, and show at the end of the channel."""
-LEAST_DRIFT, MOST_DRIFT, DRIFT_SHARE = 0.003, 0.1, 0.35
-"""A drift counts from this rate on, where durations and lags agree on it to this share."""
-DRIFT_WINDOW_S, DRIFT_ROUNDS = 20.0, 3
 
 
 @dataclass(frozen=True)
@@ -37,29 +35,6 @@ class JumpAhead:
 
     row: int
     step_ns: int
-
-
-@dataclass(frozen=True)
-class Drift:
-    """True time of a clock: anchor + offset + scale (t - anchor).
-
-    `spread` is half the 95 % interval of the drift rate, `r` the correlation of the signals.
-    """
-
-    anchor_ns: int
-    offset_s: float
-    scale: float
-    spread: float
-    r: float
-
-    def corrected(self, t_ns: TimesNs) -> TimesNs:
-        """True times of the drifting clock."""
-        since = (t_ns - self.anchor_ns) * self.scale + self.offset_s * 1e9
-        return np.asarray(self.anchor_ns + np.rint(since).astype(np.int64))
-
-    def reversed(self) -> "Drift":
-        """The drift of the other clock of the pair, were this one right."""
-        return Drift(self.anchor_ns, -self.offset_s / self.scale, 1.0 / self.scale, self.spread, self.r)
 
 
 def clock_jumps(recording: Recording, pairs: motion.SensorPairs) -> dict[str, list[JumpAhead]]:
@@ -150,89 +125,6 @@ def _ends_late(recording: Recording, name: str, step_ns: int) -> bool:
     return abs(own[0] - start_ns) < slack_ns and abs(own[-1] - end_ns - step_ns) < slack_ns
 
 
-def clock_drifts(recording: Recording, pairs: motion.SensorPairs) -> dict[motion.Pair, Drift]:
-    """Drifts of the second clock of a pair against the first: durations and growing lags agree on it."""
-    clocks, found = clocks_of(recording), {}
-    for pair, signals in pairs.items():
-        spans = [float(clocks[name][-1]) - float(clocks[name][0]) for name in pair]
-        rate = spans[1] / spans[0] - 1.0 if spans[0] > 0.0 else 0.0
-        if LEAST_DRIFT < abs(rate) < MOST_DRIFT:
-            drift = _drift(*signals, rate)
-            if drift is not None:
-                found[pair] = drift
-    return found
-
-
-def _drift(one: motion.Signal, other: motion.Signal, rate: float) -> Drift | None:
-    """The drift of the second clock by the lags at both ends of the log, where they agree with `rate`.
-
-    The lags are measured on the clock as corrected so far, so that the drift does not blur them.
-    """
-    anchor = int(other[0][0])
-    drift = Drift(anchor, 0.0, 1.0 / (1.0 + rate), 0.0, 1.0)
-    for _ in range(DRIFT_ROUNDS):
-        line = _growing_lag(one, (drift.corrected(other[0]), other[1]), anchor)
-        if line is None:
-            return None
-        at_anchor_s, slope, spread, r = line
-        drift = Drift(
-            anchor, drift.offset_s * (1.0 - slope) - at_anchor_s, drift.scale * (1.0 - slope), spread, r
-        )
-        estimated = 1.0 / drift.scale - 1.0
-        if abs(estimated - rate) > DRIFT_SHARE * abs(rate) or spread > 0.5 * abs(estimated):
-            return None
-    return drift
-
-
-def _growing_lag(
-    one: motion.Signal, other: motion.Signal, anchor: int
-) -> tuple[float, float, float, float] | None:
-    """Lag at the anchor, its growth with 95 % interval, and the correlation, from both ends of the log."""
-    start, end = float(max(one[0][0], other[0][0])), float(min(one[0][-1], other[0][-1]))
-    window = max(DRIFT_WINDOW_S * 1e9, 0.2 * (end - start))
-    if end - start < 2.0 * window:
-        return None
-    lags = []
-    for begin in (start, end - window):
-        part = [(t >= begin) & (t < begin + window) for t in (one[0], other[0])]
-        lag = motion.near_lag((one[0][part[0]], one[1][part[0]]), (other[0][part[1]], other[1][part[1]]))
-        if lag is None or lag.r < motion.LEAST_R:
-            return None
-        lags.append(lag)
-    apart_s = (end - start - window) * 1e-9
-    slope = (lags[1].seconds - lags[0].seconds) / apart_s
-    spread = 0.5 * float(np.linalg.norm([lag.high_s - lag.low_s for lag in lags])) / apart_s
-    at_anchor_s = lags[0].seconds - slope * (start + 0.5 * window - anchor) * 1e-9
-    return at_anchor_s, slope, spread, min(lag.r for lag in lags)
-
-
-def _odd_duration(recording: Recording, names: set[str]) -> str:
-    """The channel whose duration is furthest from the median of all; of equals the one of lowest rate."""
-    spans = {name: float(t[-1]) - float(t[0]) for name, t in clocks_of(recording).items()}
-    median = float(np.median(list(spans.values())))
-    oddness = {name: round(abs(spans[name] / median - 1.0), 4) for name in names}
-    return max(sorted(names), key=lambda name: (oddness[name], period_s(clocks_of(recording)[name])))
-
-
-def drift_finding(recording: Recording, drifts: dict[motion.Pair, Drift]) -> Finding:
-    """The finding on the clock that drifts."""
-    name = _odd_duration(recording, {name for pair in drifts for name in pair})
-    pair = min((p for p in drifts if name in p), key=lambda p: drifts[p].spread)
-    drift = drifts[pair] if name == pair[1] else drifts[pair].reversed()
-    scaled = dataclasses.replace(drift, offset_s=0.0)  # an offset is a later finding
-    rate, against = 1.0 / drift.scale - 1.0, pair[0] if name == pair[1] else pair[1]
-    return Finding(
-        "clock-drift", "error", name,
-        f"its clock runs {abs(rate):.2%} too {'fast' if rate > 0 else 'slow'}",
-        f"{rate:+.3%} +- {drift.spread:.3%} against {against} by the lags at both ends of the log "
-        f"(correlation {drift.r:.2f}); their durations differ by the same rate",
-        f"scale the times of {name} about its first; {motion.reason(name, set(drifts))}",
-        retiming(name, scaled.corrected),
-    )  # fmt: skip
-
-
-LEAST_LAG_S = dict.fromkeys(motion.YAW_PAIRS, 0.1) | dict.fromkeys(motion.SPEED_PAIRS, 0.2)
-"""Smaller lags are no finding; slip distorts the speed of wheels, so that theirs may be larger."""
 ERROR_FROM_S = 0.5
 """An interval that is all beyond this is an error."""
 SLIDING_S = 2.0
@@ -257,8 +149,8 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     yield from gap_findings(context, {name: [jump.row for jump in found] for name, found in jumps.items()})
     if jumps:
         yield from jump_findings(context, jumps)
-    elif drifts := clock_drifts(context.recording, pairs):
-        yield drift_finding(context.recording, drifts)
+    elif (drifts := clock_drifts(context.recording, pairs))[0]:
+        yield drift_finding(context.recording, *drifts)
     else:
         corrected = on_one_clock(context)
         if corrected is not context:

@@ -74,6 +74,18 @@ CHECKS: tuple[Check, ...] = (
 
 UNIT_CHECKS: tuple[Check, ...] = (yaw_agreement.check_gyro_unit, scale.check_speed_scale)
 UNIT_CODES = ("gyro-in-degrees", "wheel-unit")
+_SCALES = {"wheel-radius", "wheel-scale", "wheel-sides", "gyro-scale"}
+_COMPARED = _SCALES | {"sigma-too-small", "standing", "yaw-unrelated"}
+CONSEQUENCES = {
+    ("gyro-in-degrees", "imu"): _COMPARED | {"gyro-bias"},
+    ("stuck", "imu"): _COMPARED,
+    ("dead", "imu"): _COMPARED,
+    ("dead", "wheels"): _COMPARED | {"clock-offset"},
+    ("spikes", "imu"): _SCALES,
+    ("wheel-sign", "wheels"): _COMPARED,
+    ("gnss-degrees", "gnss"): _COMPARED | {"gnss-jumps"},
+}
+"""Findings that another one, by code and channel, may bring about: they count once it is repaired."""
 LARGEST = 1e6
 """Numbers up to this may be in small units (mm/s, deg/s); larger ones are not computed with."""
 
@@ -96,8 +108,8 @@ def _findings(context: CheckContext) -> list[Finding]:
         units = [finding for check in UNIT_CHECKS for finding in check(context) if finding.code in UNIT_CODES]
         explained = {finding.channel for finding in units}
         findings = units + [finding for finding in findings if finding.channel not in explained]
-    if any(finding.code == "gyro-in-degrees" for finding in findings):  # its mean is in another unit, too
-        findings = [finding for finding in findings if finding.code != "gyro-bias"]
+    found = [CONSEQUENCES.get((finding.code, finding.channel), set[str]()) for finding in findings]
+    findings = [finding for finding in findings if not any(finding.code in codes for codes in found)]
     return sorted(findings, key=lambda finding: finding.severity != "error")
 
 

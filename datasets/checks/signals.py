@@ -249,7 +249,15 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
     recording = context.recording
     imu, wheels = recording.imu, recording.wheels
     standing = wheels is not None and not np.nan_to_num(wheels.speed).any()
-    extent_m = _extent_m(recording) if standing else 0.0
+    side = "" if wheels is None or standing else _dead_side(wheels)
+    extent_m = _extent_m(recording) if standing or side else 0.0
+    if side and extent_m > LEAST_EXTENT_M:
+        yield Finding(
+            "dead", "error", "wheels",
+            f"the {side} side stands throughout",
+            f"its every speed is zero while the other side rolls and the robot covers {extent_m:.0f} m",
+            "record both sides; is a joint or an encoder named wrongly, or broken?",
+        )  # fmt: skip
     if wheels is not None and len(wheels) >= STUCK_ROWS and standing and extent_m > LEAST_EXTENT_M:
         yield Finding(
             "dead", "error", "wheels",
@@ -272,6 +280,14 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
             "leave the gyro out",
             without_cells([("gyro_radps", np.ones((len(imu), 3), dtype=bool))], "imu"),
         )  # fmt: skip
+
+
+def _dead_side(wheels: Wheels) -> str:
+    """The side whose every speed is zero while the other one rolls; "" without."""
+    if len(wheels) < STUCK_ROWS or not wheels.has_sides():
+        return ""
+    rolls = np.nan_to_num(wheels.side_speeds_mps(1.0)).any(axis=0)
+    return "" if rolls.all() else ("left", "right")[int(np.argmin(rolls))]
 
 
 def _stops_turning(recording: Recording) -> bool:

@@ -17,6 +17,11 @@ DAY_NS = 86_400 * 10**9
 OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
 """A time of day alone."""
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?!\d)")
+_SLASHED = re.compile(r"(\d{1,2})[/-](\d{1,2})[/-](\d{4})(?!\d)")
+_NAMED = re.compile(r"(\d{1,2})[- ]([A-Za-z]{3})[- ](\d{4})(?!\d)")
+_MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
+_HALF_DAY = re.compile(r"(?<!\d)(\d{1,2})(:\d\d(?::\d\d(?:\.\d+)?)?) ?([ap])\.?m\.?$", re.IGNORECASE)
+_ZONE = re.compile(r" (?:UTC|GMT|([+-]\d\d:?\d\d))$")
 
 
 class NotADecimal(ValueError):  # noqa: N818
@@ -92,8 +97,35 @@ def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
 
 
 def iso_dates(texts: Sequence[str]) -> list[str]:
-    """Dates and times without blanks around, also from 3.9.2020 12:00:00,5: with points the day is first."""
-    return [
-        _DAY_FIRST.sub(lambda d: f"{d[3]}-{d[2]:0>2}-{d[1]:0>2}", text.strip(), count=1).replace(",", ".")
-        for text in texts
-    ]
+    """Dates and times without blanks around as in ISO 8601, where one of them tells how they are meant.
+
+    3.9.2020 has the day first, 3-Sep-2020 names the month; with slashes that is told by a date of the column
+    such as 9/13/2020. A date that is not understood stays as it is.
+    """
+    plain = [text.strip().replace(",", ".") for text in texts]
+    if any(text[-1:] in "mM." for text in plain):
+        plain = [_HALF_DAY.sub(_of_24_hours, text) for text in plain]
+    if any(map(_ZONE.search, plain)):
+        plain = [_ZONE.sub(lambda zone: zone[1] or "Z", text) for text in plain]
+    pairs = {(int(d[1]), int(d[2])) for d in map(_SLASHED.match, plain) if d}
+    months, days = {first for first, _ in pairs}, {second for _, second in pairs}
+    month_first = max(months, default=13) <= 12 and (max(days) > 12 or all(a == b for a, b in pairs))
+    if month_first or (max(days, default=13) <= 12 < max(months)):
+        month, day = (1, 2) if month_first else (2, 1)
+        plain = [
+            _SLASHED.sub(lambda d: f"{d[3]}-{d[month]:0>2}-{d[day]:0>2}", text, count=1) for text in plain
+        ]
+    return [_NAMED.sub(_of_named, _DAY_FIRST.sub(_of_day_first, text, count=1), count=1) for text in plain]
+
+
+def _of_day_first(date: re.Match[str]) -> str:
+    return f"{date[3]}-{date[2]:0>2}-{date[1]:0>2}"
+
+
+def _of_named(date: re.Match[str]) -> str:
+    name = date[2].lower()
+    return f"{date[3]}-{_MONTHS.index(name) + 1:02}-{date[1]:0>2}" if name in _MONTHS else date[0]
+
+
+def _of_24_hours(time: re.Match[str]) -> str:
+    return f"{int(time[1]) % 12 + 12 * (time[3] in 'pP'):02}{time[2]}"

@@ -33,7 +33,23 @@ BLANKS = r"\s+"
 
 UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
-MISSING = ("", "NaN", "nan", "NAN", "-nan")
+MISSING = (
+    "",
+    "NaN",
+    "nan",
+    "NAN",
+    "-nan",
+    "N/A",
+    "n/a",
+    "NA",
+    "#N/A",
+    "null",
+    "NULL",
+    "None",
+    "-",
+    "--",
+    "---",
+)
 """Cells of a numeric column that stand for no value."""
 
 TRUTH_WORDS = (b"rue", b"RUE", b"alse", b"ALSE")
@@ -92,13 +108,13 @@ class TextTable(Columns):
     data: bytes
 
     def times_ns(self, name: str, unit: str = "s") -> TimesNs:
-        """A text column of decimal times as nanoseconds (N,).
+        """A text column of decimal times as nanoseconds (N,), also with MATLAB's " sec" behind them.
 
         Raises:
             DataError: a cell is no number; the message names the line.
         """
         try:
-            return to_ns(self.texts[name].tolist(), unit)
+            return to_ns([text.removesuffix(" sec") for text in self.texts[name].tolist()], unit)
         except NotADecimal as bad:
             raise self.bad_cell(name, bad.row, f"every row needs its time, in {UNIT_NAMES[unit]}") from None
 

@@ -43,10 +43,10 @@ from terrafusion.datasets.readers.ros.streams import (
 )
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
 from terrafusion.datasets.readers.ros.topics import (
-    FIX,
     IMU,
     JOINTS,
     ODOMETRY,
+    TYPES,
     BagTopic,
     choose_topics,
     joints_given,
@@ -278,7 +278,7 @@ def _one_sensor(
 
 def _holds_data(stream: Stream) -> bool:
     """Whether a sensor's messages hold anything: a fix, or a number that is not zero."""
-    if stream.msgtype == FIX:
+    if stream.msgtype in TYPES["gnss"]:
         return bool(has_fix(stream.column("status.status")).any())
     if stream.msgtype == IMU:
         values = np.hstack([stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")])

@@ -49,6 +49,8 @@ from terrafusion.datasets.readers.ros.streams import (
     UNKNOWN_VARIANCE,
     UNSET_STATUS,
     Stream,
+    fix_sigmas,
+    fix_velocities,
     has_fix,
     poses,
     twists,
@@ -345,7 +347,10 @@ class ChannelBuilder:
             self.notes.append(f"gnss: {stream.topic} leaves the status of {count} unset; taken as single")
         for number, fix_class in FIX_OF_CODE["navsatfix"].items():
             fix[status == number] = fix_class
-        fixes = Fixes(t_ns, llh, fix, self._sigma(stream))
+        velocity, sigma_v = fix_velocities(stream)
+        if velocity is not None:
+            self.notes.append(f"gnss: velocity of speed and track of {stream.topic}")
+        fixes = Fixes(t_ns, llh, fix, fix_sigmas(stream), velocity, sigma_v)
         rows = f"messages of {stream.topic}"
         gnss, datum, notes = gnss_channel(self.rig, fixes, datum, rows=rows, channel=stream.topic)
         self.notes += notes
@@ -354,16 +359,6 @@ class ChannelBuilder:
     def _llh(self, stream: Stream) -> Array:
         """Latitude, longitude (deg) and height (m), (N, 3)."""
         return np.stack([stream.column(name).astype(float) for name in NAVSATFIX], axis=1)
-
-    def _sigma(self, stream: Stream) -> Array:
-        """Sigmas (N, 3) m, NaN where the receiver gives no covariance."""
-        variance = np.stack(
-            [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)], axis=1
-        )
-        variance[stream.column("position_covariance_type") == 0] = np.nan
-        variance[variance >= UNKNOWN_VARIANCE] = np.nan
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.sqrt(variance))
 
     def gnss_velocity(self, gnss: Gnss, stream: Stream, t_ns: TimesNs) -> Gnss:
         """The fixes with the ENU velocity of another topic, matched within half a fix interval."""

@@ -19,6 +19,8 @@ from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, BagSour
 
 UNKNOWN_VARIANCE = 1e6
 """By ROS custom, a variance this large marks an unknown quantity."""
+SIGMAS_IN_95 = 1.96
+"""Errors that a GPSFix gives are those of 95 %."""
 UNSET_STATUS = -2
 """Of a NavSatFix whose driver does not set it, since ROS 2 Iron; -1 is no fix."""
 
@@ -44,7 +46,39 @@ DEFINITIONS[topics.ACKERMANN_STAMPED] = (
     "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
     f"{'=' * 80}\nMSG: ackermann_msgs/AckermannDrive\n{DEFINITIONS[topics.ACKERMANN]}"
 )
-"""Types that are not part of ROS 2 itself."""
+DEFINITIONS[topics.GPS_FIX] = f"""std_msgs/Header header
+gps_msgs/GPSStatus status
+float64 latitude
+float64 longitude
+float64 altitude
+float64 track
+float64 speed
+float64 climb
+float64[3] pitch_roll_dip
+float64 time
+float64[5] dilutions
+float64[3] err_horz_vert
+float64 err_track
+float64 err_speed
+float64[5] err_climb_time_pitch_roll_dip
+float64[9] position_covariance
+uint8 position_covariance_type
+{"=" * 80}
+MSG: gps_msgs/GPSStatus
+std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source
+"""
+"""Types that are not part of ROS 2 itself; numbers that are not read stand in arrays, of the same bytes."""
 DIAGONAL = range(0, 36, 7)
 _RATE, _FORCE, _SIGMA = "angular_velocity", "linear_acceleration", "position_covariance"
 FIELDS = {
@@ -57,6 +91,8 @@ FIELDS = {
     topics.FIELD: ("magnetic_field",),
     topics.JOINTS: ("name", "position", "velocity"),
 }  # fmt: skip
+FIELDS[topics.GPS_FIX] = (*FIELDS[topics.FIX], "track", "speed", "climb", "err_speed")
+FIELDS[topics.GPS_FIX_1] = FIELDS[topics.GPS_FIX]
 """Paths of the fields that are read of other types."""
 
 
@@ -155,6 +191,29 @@ class Stream:
 def has_fix(status: NDArray[Any]) -> NDArray[np.bool_]:
     """Mask (N,) of the statuses of NavSatFix that do not say that there is none."""
     return np.asarray((status >= 0) | (status == UNSET_STATUS))
+
+
+def fix_sigmas(stream: Stream) -> Array:
+    """Sigmas (N, 3) m of fixes, NaN where the receiver gives no covariance."""
+    variance = np.stack([stream.column(f"{_SIGMA}.{i}").astype(float) for i in (0, 4, 8)], axis=1)
+    variance[stream.column(f"{_SIGMA}_type") == 0] = np.nan
+    variance[variance >= UNKNOWN_VARIANCE] = np.nan
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(variance))
+
+
+def fix_velocities(stream: Stream) -> tuple[Array | None, Array | None]:
+    """ENU velocities (N, 3) m/s of GPSFix and their sigmas (N,), NaN where the driver leaves the speed at
+    zero; None where all are, and of other fixes."""
+    speed = stream.column("speed").astype(float) if stream.has("speed") else np.zeros(0)
+    if not np.nan_to_num(speed).any():
+        return None, None
+    track, climb, within = (stream.column(name).astype(float) for name in ("track", "climb", "err_speed"))
+    east, north = speed * np.sin(np.radians(track)), speed * np.cos(np.radians(track))
+    up = climb if np.nan_to_num(climb).any() else np.full(len(climb), np.nan)
+    sigma = np.where(within > 0.0, within, np.nan) / SIGMAS_IN_95
+    velocity = np.where(speed[:, None] != 0.0, np.stack([east, north, up], axis=1), np.nan)
+    return velocity, None if np.isnan(sigma).all() else sigma
 
 
 def twists(stream: Stream) -> tuple[Array, Array]:

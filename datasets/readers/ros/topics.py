@@ -11,6 +11,8 @@ from terrafusion.datasets.core.errors import DataError
 IMU = "sensor_msgs/msg/Imu"
 JOINTS = "sensor_msgs/msg/JointState"
 FIX = "sensor_msgs/msg/NavSatFix"
+GPS_FIX, GPS_FIX_1 = "gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix"
+"""A fix with its velocity; the second is that of ROS 1."""
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
@@ -26,7 +28,7 @@ STRING = "std_msgs/msg/String"
 TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN, TWIST),
-    "gnss": (FIX,),
+    "gnss": (FIX, GPS_FIX, GPS_FIX_1),
     "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
     "command": (TWIST_STAMPED, TWIST),
     "truth": (ODOMETRY, POSE_COVARIANCE, POSE),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -37,6 +38,8 @@ UNITS: dict[str, dict[str, float]] = {
 """Factor from each unit to that of the field, the first. g: standard gravity; mph, kn, ft: international."""
 
 
+DDMM = "ddmm"
+"""Unit of NMEA: 4807.5 are 48 degrees and 7.5 minutes."""
 VARIANCE = "m2"
 """Unit of a sigma's column that holds its square."""
 
@@ -45,6 +48,8 @@ def units_of(field: str) -> dict[str, float]:
     """The units that a column for `field` may be in, with their factors."""
     if field in GNSS_SIGMA:
         return UNITS["m"] | {VARIANCE: 1.0}
+    if field in GEODETIC[:2]:
+        return UNITS["deg"] | {DDMM: 1.0}
     ending = field.rpartition("_")[2]
     numeric = (field not in TRUTH_TWIST and field.startswith(("p_", "cov_"))) or "_" not in field
     return UNITS[""] if numeric or ending not in UNITS else UNITS[ending]
@@ -108,13 +113,19 @@ class _Scale(Parsed):
 class MappedColumn:
     """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way.
 
-    The numbers of the column, times `scale`, are in the unit.
+    The numbers of the column, times `scale`, are in the unit. Those of latitudes and longitudes are negative
+    where the column `hemisphere`, "" for none, says S or W.
     """
 
     column: str
     unit: str = ""
     sign: Annotated[str, Word(("+", "-"))] = "+"
     scale: Annotated[float, _Scale()] = 1.0
+    hemisphere: str = ""
+
+    def columns(self) -> list[str]:
+        """Names of the columns that hold it."""
+        return [self.column, *([self.hemisphere] if self.hemisphere else [])]
 
 
 @dataclass(frozen=True)
@@ -172,13 +183,14 @@ class ColumnMap(ColumnMapFile):
 
     def columns(self) -> list[str]:
         """Names of all columns that are asked for, each once."""
-        fields = (of.column for channel in self.channels.values() for of in channel.values())
-        return list(dict.fromkeys([*self.time.columns(), *fields]))
+        fields = [of.columns() for channel in self.channels.values() for of in channel.values()]
+        return list(dict.fromkeys([*self.time.columns(), *itertools.chain(*fields)]))
 
     def words(self) -> set[str]:
         """Names of the columns that hold words."""
-        fields = (field for channel in self.channels.values() for field in channel.items())
-        return {of.column for name, of in fields if name in TEXT_FIELDS}
+        fields = [field for channel in self.channels.values() for field in channel.items()]
+        hemispheres = {of.hemisphere for _, of in fields if of.hemisphere}
+        return hemispheres | {of.column for name, of in fields if name in TEXT_FIELDS}
 
 
 def read_column_map(path: Path) -> ColumnMap:
@@ -265,6 +277,8 @@ def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple
         allowed = ", ".join(unit for unit in units if unit)
         remedy = f"give one of {allowed}" if allowed else "leave the unit out"
         yield f"'{here}' is in the unit '{shown(of.unit)}'", remedy
+    if of.hemisphere and name not in GEODETIC[:2]:
+        yield f"'{here}' has a hemisphere", f"only {' and '.join(GEODETIC[:2])} have one"
     if name in TEXT_FIELDS and of.sign != "+":
         yield f"'{here}' has the sign '-', but is a text", "leave the sign out"
     if name in TEXT_FIELDS and of.scale != 1.0:

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,14 @@ import numpy as np
 from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, VARIANCE, YAW_RATE, units_of
+from terrafusion.datasets.readers.text.column_map import (
+    DDMM,
+    FIELDS,
+    TEXT_FIELDS,
+    VARIANCE,
+    YAW_RATE,
+    units_of,
+)
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
@@ -78,13 +85,22 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
-        (rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel)_?{a}", "imu", (f"gyro_{a}_radps",))
-        for a in "xyz"
+        (
+            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}",
+            "imu",
+            (f"gyro_{a}_radps",),
+        )
+        for i, a in enumerate("xyz")
     ),
     (r"yaw_?rate|gyro_yaw|yaw_dot|gyro", "imu", ("gyro_z_radps",)),
     *(
-        (rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc)_?{a}", "imu", (f"accel_{a}_mps2",))
-        for a in "xyz"
+        (
+            rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc|(?:total_)?acceler(?:ation|ometer))_?{a}"
+            rf"|accelerometer_m_s2_{i}",
+            "imu",
+            (f"accel_{a}_mps2",),
+        )
+        for i, a in enumerate("xyz")
     ),
     *((_beside(_SPEED, s), "wheels", (f"{side}_mps", f"{side}_radps")) for side, s in _SIDES.items()),
     *(
@@ -112,8 +128,22 @@ _MESSAGE = re.compile(
     r"|latitude|longitude|altitude|status_status|header_stamp|position_covariance_?[048])"
 )
 """Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
+_OF_FILE = (
+    ("gyro", re.compile(r"gyro", re.IGNORECASE)),
+    ("acc", re.compile(r"^(?!.*lin).*acc", re.IGNORECASE)),
+)
+"""Sensors whose files, by their names, may call columns just x, y, z; a linear acceleration lacks gravity."""
+_COURSE = re.compile(r"(^|_)(bearing|course|cog|g_?crs|track_angle|direction)(_|$)")
+"""Names of a receiver's direction of motion, which its speed stands beside."""
+_SCALED = 1e6
+"""A latitude or longitude above that is in 1e-7 deg; heights beside it are in mm (as MAVLink has them)."""
+_LONGEST_STEP_S = 2.0
+"""Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_HEMISPHERES = {"latitude_deg": ("N", "S"), "longitude_deg": ("E", "W")}
+_NMEA_PLACE = re.compile(r"-?\d{4,5}\.\d+")
+"""A latitude or longitude in degrees and minutes; with zeros in front of small ones."""
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
@@ -141,9 +171,27 @@ class _Header:
     sensor: str
 
 
-def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
-    """A first column map, on one line, for the user to correct; the first row's cells tell units."""
+def starter_map(
+    names: Sequence[str],
+    first: Sequence[str] = (),
+    units: Sequence[str] = (),
+    *,
+    of_file: str = "",
+    step: Callable[[str], float] = lambda name: 0.0,
+) -> str:
+    """A first column map, on one line, for the user to correct.
+
+    The first row's cells tell units, as do those of a line of `units` below the header and the median `step`
+    of a column; the name `of_file` tells the sensor of columns x, y, z.
+    """
     headers = [_header(name) for name in names]
+    if {"x", "y", "z"} <= {h.base for h in headers}:
+        sensor = next((word for word, name in _OF_FILE if name.search(of_file)), "")
+        headers = [
+            replace(h, base=f"{sensor}_{h.base}") if sensor and h.base in "xyz" else h for h in headers
+        ]
+    for k, (header, unit) in enumerate(zip(headers, units, strict=False)):
+        headers[k] = header if header.unit else replace(_header(f"{header.column} [{unit}]"), column=names[k])
     cells = dict(zip(names, first, strict=False))
     times = [h for h in headers if _TIME.search(h.base)]
     of_day = [h for h in times if _cell_of_day(h, cells)]
@@ -155,14 +203,23 @@ def starter_map(names: Sequence[str], first: Sequence[str] = ()) -> str:
             continue
         for channel, field in _guesses(header):
             if field not in channels.get(channel, {}):
-                channels.setdefault(channel, {})[field] = _entry(header, field)
+                place = _place_entry(header, cells, field) if field in _HEMISPHERES else ""
+                channels.setdefault(channel, {})[field] = place or _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
+    gnss = channels.get("gnss", {})
+    if "1e-7 deg" in gnss.get("latitude_deg", ""):
+        height = next((h for h in headers if _guess(h) == ("gnss", "height_m")), None)
+        if height is not None and not height.unit:
+            gnss["height_m"] = _entry(replace(height, unit="mm"), "height_m")
+    if gnss and any(_COURSE.search(h.base) for h in headers) and "speed_mps" in channels.get("wheels", {}):
+        del channels["wheels"]
     sections = ", ".join(
         f"{channel}: {{{', '.join(f'{field}: {entry}' for field, entry in fields.items())}}}"
         for channel, fields in channels.items()
     )
     day = _day(headers, time, cells)
-    return f"time: {_time_entry(time, cells.get(time.column, ''), rest, day)}, channels: {{{sections}}}"
+    entry = _time_entry(time, cells.get(time.column, ""), rest, day, step(time.column))
+    return f"time: {entry}, channels: {{{sections}}}"
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
@@ -252,6 +309,20 @@ def _entry(header: _Header, field: str) -> str:
     return f"{{column: {name}, unit: {header.unit}}}"
 
 
+def _place_entry(header: _Header, cells: Mapping[str, str], field: str) -> str:
+    """The entry of a latitude or longitude beside a column of its hemisphere, or as NMEA writes it; "" for
+    another."""
+    beside = [name for name, cell in cells.items() if cell.strip() in _HEMISPHERES[field]]
+    cell = cells.get(header.column, "").strip()
+    unit = header.unit or (DDMM if _NMEA_PLACE.fullmatch(cell) else "")
+    if not unit and abs(number_in(cell) or 0.0) > _SCALED:
+        unit = "1e-7 deg"
+    parts = [("column", header.column), *([("unit", unit)] if unit else [])]
+    parts += [("hemisphere", name) for name in beside[:1]]
+    written = (f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in parts)
+    return f"{{{', '.join(written)}}}" if beside or unit != header.unit else ""
+
+
 def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     """The channels without fields that cannot stand alone, and of wheels the best layout only."""
     found = {channel: dict(fields) for channel, fields in channels.items()}
@@ -274,6 +345,8 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
     one = {name: wheels[name] for name in ("speed_mps", YAW_RATE) if "speed_mps" in wheels and name in wheels}
     found["wheels"] = {name: wheels[name] for name in layout} or one
+    if YAW_RATE in found["wheels"] and '"x"' in found.get("truth", {}).get("x_m", "").lower():
+        del found["truth"]  # of the odometry that gives the speeds
     return {channel: fields for channel, fields in found.items() if fields}
 
 
@@ -301,11 +374,12 @@ def _day(headers: Sequence[_Header], time: _Header, cells: Mapping[str, str]) ->
     return known[0] if known and _cell_of_day(time, cells) else ""
 
 
-def _time_entry(time: _Header, cell: str, rest: str, day: str) -> str:
+def _time_entry(time: _Header, cell: str, rest: str, day: str, step: float) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
-    unit, epoch = time.unit if time.unit in TIME_UNITS else "", "unix"
+    unit, epoch = time.unit or UNIT_OF.get(time.base, ""), "unix"
+    unit = unit if unit in TIME_UNITS else ""
     since = f", epoch: {json.dumps(day)}" if day else ""
-    value = number_in(cell.replace(",", "."))
+    value = number_in(cell.removesuffix(" sec").replace(",", "."))
     if value is None and cell.strip():
         return f"{{column: {name}, unit: iso8601{since}}}"
     if value is None:
@@ -314,7 +388,10 @@ def _time_entry(time: _Header, cell: str, rest: str, day: str) -> str:
         unit = unit or ("ms" if abs(value) > WEEK_S or time.base == "i_tow" else "s")
         return f"{{column: {name}, unit: {unit}{since or ', epoch: none'}}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
-    unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "s")
+    unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "")
+    if not unit and abs(value) < 0.1 * size["s"] and step == round(step):
+        unit = next((known for known in TIME_UNITS if step <= _LONGEST_STEP_S * size[known] * 1e-9), "")
+    unit = unit or "s"
     if abs(value) < 0.1 * size[unit]:
         epoch = "none"
     split = f", nanoseconds: {json.dumps(rest, ensure_ascii=False)}" if rest else ""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import TimesNs, distinct
+from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import DAY_NS, OF_DAY, NotADecimal, dates_to_ns, iso_dates
@@ -18,12 +18,14 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import UP_FACTOR
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import GNSS_SIGMA, GNSS_VELOCITY, QUATERNION, ChannelReader
-from terrafusion.datasets.readers.delimited import head_lines, number_in, separator_of, split
+from terrafusion.datasets.readers.delimited import MISSING, head_lines, number_in, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
+    DDMM,
     EPOCHS,
     GEODETIC,
     TEXT_FIELDS,
@@ -83,7 +85,7 @@ def read(request: Request) -> list[Recording]:
         column_map = contract_map(columns.names)
         notes = ["columns are known by the log folder's names for them"]
     if column_map is None:
-        raise _mapless(path, columns.names, columns.first_cells())
+        raise _mapless(path, columns)
     for name in column_map.columns():
         if name not in columns.names:
             raise DataError(f"there is no column '{name}'", remedy=f"the file has {_few(columns.names)}")
@@ -95,10 +97,11 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:SHOWN_COLUMNS])
 
 
-def _mapless(path: Path, names: list[str], first: list[str]) -> DataError:
+def _mapless(path: Path, columns: TableColumns) -> DataError:
+    names, first = columns.names, columns.first_cells()
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
-    proposal = starter_map(names, first)
+    proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)
     if names == numbered(len(names)):
         proposal = f"header: none, {proposal}"
         given = f"{', '.join(names)} (first row: {', '.join(first)})"
@@ -196,7 +199,8 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
     except NotADecimal as bad:
         raise DataError(
             f"column '{time.column}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
-            remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
+            remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map "
+            "(of dates such as 5/1/2024 alone nothing tells day and month)",
         ) from None
     if not of_day:
         zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", plain[0])
@@ -224,6 +228,10 @@ def _table(
         if name not in TEXT_FIELDS:
             factor = units_of(name).get(of.unit, 1.0) * (-of.scale if of.sign == "-" else of.scale)
             values = columns.numbers(of.column)[order]
+            if of.unit == DDMM:
+                values = _degrees(values, of.column)
+            if of.hemisphere:
+                values = values * _signs(columns.texts(of.hemisphere)[order], of.hemisphere)
             numbers[name] = values if factor == 1.0 else values * factor
             if of.unit == VARIANCE:  # zero and below: the receiver knows none
                 numbers[name] = np.sqrt(np.where(numbers[name] <= 0.0, np.nan, numbers[name]))
@@ -237,6 +245,25 @@ def _table(
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 
+def _degrees(values: Array, column: str) -> Array:
+    """Degrees (N,) of numbers such as 4807.5, which are degrees and minutes."""
+    degrees = np.trunc(values / 100.0)
+    minutes = values - 100.0 * degrees
+    if (np.abs(minutes) >= 60.0).any():
+        bad = values[np.flatnonzero(np.abs(minutes) >= 60.0)[0]]
+        raise DataError(f"column '{column}' is {bad:.12g}: no minutes", remedy="is its unit deg?")
+    return degrees + minutes / 60.0
+
+
+def _signs(letters: NDArray[Any], column: str) -> Array:
+    """Signs (N,) of hemispheres, NaN where there is none."""
+    signs = {"N": 1.0, "E": 1.0, "S": -1.0, "W": -1.0} | dict.fromkeys(MISSING, math.nan)
+    words, inverse = distinct(letters)
+    if strange := [word for word in words if word.strip().upper() not in signs]:
+        raise DataError(f"column '{column}' is '{strange[0][:40]}'", remedy="give N, S, E or W")
+    return np.array([signs[word.strip().upper()] for word in words])[inverse]
+
+
 def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     """Texts (N,) of a column; codes of fixes in words."""
     texts = columns.texts(of.column)
@@ -247,7 +274,7 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     numbers = map(number_in, words)
     meanings = ["" if number is None else codes.get(number, "") for number in numbers]
     for word, meant in zip(words, meanings, strict=True):
-        if word.strip() and not meant:
+        if word.strip() not in MISSING and not meant:
             raise DataError(
                 f"column '{of.column}' is '{word[:40]}'",
                 remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
@@ -265,11 +292,14 @@ class _Reader(ChannelReader):
             if (a in table.numbers) != (b in table.numbers):
                 raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
         local = "latitude_deg" not in table.numbers
+        sigma = table.stack(GNSS_SIGMA)
+        if "sigma_e_m" in table.numbers and "sigma_u_m" not in table.numbers:
+            sigma[:, 2] = UP_FACTOR * sigma[:, :2].max(axis=1)
         fixes = Fixes(
             self._t(table),
             table.stack(("east_m", "north_m", "up_m") if local else GEODETIC),
             self._fix(table),
-            table.stack(GNSS_SIGMA),
+            sigma,
             table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None,
             table.numbers.get("sigma_v_mps"),
             local,

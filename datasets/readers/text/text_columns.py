@@ -1,5 +1,6 @@
 """Columns of a plain table: of text, and where its header is; of Parquet, by pyarrow, which is optional."""
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ from terrafusion.datasets.readers.delimited import (
     split,
 )
 from terrafusion.datasets.readers.text.column_map import ColumnMap
+from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
@@ -45,6 +47,9 @@ class TextColumns:
         text = read_text(path)
         self._layout = _layout(text, column_map)
         text, self._repeated = _headed_once(text, self._layout)
+        self.units = _units_below(text, self._layout)
+        if self.units:
+            self._layout = dataclasses.replace(self._layout, first_line=self._layout.first_line + 1)
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -57,10 +62,20 @@ class TextColumns:
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
         self.notes += [again] if self._repeated else []
+        self.notes += ["the line below the header holds units; left out"] if self.units else []
 
     def first_cells(self) -> list[str]:
-        """The cells of the first row; [] where there is none."""
-        return next(_sample(self._text, self._layout), [])
+        """The first value of each column, "" where none of the first rows has one; [] without rows."""
+        rows = list(_sample(self._text, self._layout))
+        columns = range(len(self.names)) if rows else ()
+        return [next((r[k] for r in rows if k < len(r) and r[k] not in MISSING), "") for k in columns]
+
+    def step(self, name: str) -> float:
+        """Median step of a column over the first rows; 0 where it holds no numbers."""
+        k = self.names.index(name)
+        cells = [number_in(row[k]) for row in _sample(self._text, self._layout) if len(row) > k]
+        values = [cell for cell in cells if cell is not None]
+        return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
@@ -126,6 +141,15 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
 
 
+def _units_below(data: bytes, layout: TextLayout) -> list[str]:
+    """The cells of a line of units below the header, without brackets; [] where that line is a row."""
+    at, line = next(((at, line) for at, line in head_lines(data) if at >= layout.first_line), (0, ""))
+    cells = [cell.strip("[]() ") for cell in split(line, layout.separator)] if at > 1 else []
+    rows = any(number_in(cell) is not None or re.search(r"\d\d", cell) for cell in cells)
+    known = any(cell.replace(" ", "").lower() in UNIT_OF for cell in cells)
+    return cells if known and not rows and len(cells) == len(layout.names) else []
+
+
 def _begin(data: bytes, line: int) -> int:
     """Where a line, from 1, begins."""
     begin = 0
@@ -170,6 +194,7 @@ class ParquetColumns:
         except self._refused as error:
             raise self._damaged(error) from None
         self.names: list[str] = list(self._file.schema_arrow.names)
+        self.units: list[str] = []
         limits.check_columns(len(self.names))
         if not self.names or len(set(self.names)) < len(self.names):
             raise DataError("has no columns, or two of one name", remedy="name each column once")
@@ -179,6 +204,10 @@ class ParquetColumns:
     def first_cells(self) -> list[str]:
         """None: the kinds of the columns say what they hold."""
         return []
+
+    def step(self, name: str) -> float:
+        """0: the kinds of the columns say what they hold."""
+        return 0.0
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""

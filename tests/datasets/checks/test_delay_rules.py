@@ -14,6 +14,7 @@ from terrafusion.datasets.checks.known_delays import lag_with_sigma, on_one_cloc
 from terrafusion.datasets.checks.motion import Pair, Signal
 from terrafusion.datasets.checks.path_model import model_by_fixes
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -36,6 +37,36 @@ def wave(period_s: float = 0.02, late_s: float = 0.0, seconds: float = 60.0) -> 
     at = t_s - late_s
     values = np.sin(1.1 * at) + np.sin(0.37 * at) + 0.5 * np.sin(2.9 * at)
     return np.rint(t_s * 1e9).astype(np.int64), values
+
+
+def turning(rate: float, step_s: float) -> Recording:
+    """200 s of turns; the IMU begins 1.5 s after the wheels, on a clock that is fast by `rate`, or with a
+    step of it in the middle."""
+    noise = np.random.default_rng(0).normal(0.0, 0.01, 20_000)
+    t_ns, gyro = wave(0.01, seconds=200.0)
+    late_ns = np.rint(t_ns * rate + (t_ns > 10**11) * step_s * 1e9).astype(np.int64)
+    gyro = np.stack([0.0 * gyro, 0.0 * gyro, 0.2 * gyro + noise], axis=1)
+    imu = Imu(t_ns + late_ns, gyro, np.full_like(gyro, np.nan)).select(t_ns > 1_500_000_000)
+    t_ns, turn = wave(0.05, seconds=200.0)
+    sides = 1.0 + 0.1 * np.outer(turn, [-1.0, 1.0])
+    wheels = Wheels(t_ns, sides, ("left", "right"), "mps")
+    return Recording("turning", 0, imu=imu, wheels=wheels)
+
+
+@pytest.mark.parametrize(
+    ("rate", "step_s"), [(0.002, 0.0), (-0.001, 0.0), (0.0002, 0.0), (0.0, 0.0), (0.0, 0.25)]
+)
+def test_a_small_drift_is_named_by_the_lags_of_channels_of_other_lengths(rate: float, step_s: float) -> None:
+    log = turning(rate, step_s)
+    findings = [finding for finding in delays.check_clocks(CheckContext(log, None)) if finding.repair]
+    assert [(f.code, f.channel) for f in findings if f.code == "clock-drift"] == (
+        [("clock-drift", "imu")] if abs(rate) >= 0.001 else []
+    )
+    for finding in findings if rate else ():
+        assert finding.repair is not None
+        imu = finding.repair(log).imu
+        assert imu is not None
+        np.testing.assert_allclose(np.diff(imu.t_ns), 1e7, rtol=2e-4)
 
 
 def test_an_interval_that_holds_zero_is_no_distance_from_it() -> None:

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run_checks
-from terrafusion.datasets.checks.finding import CheckContext, once
+from terrafusion.datasets.checks import run, run_checks
+from terrafusion.datasets.checks.finding import CheckContext, Finding, once
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -167,3 +167,29 @@ def test_what_several_checks_need_is_computed_once_a_context(drive: Recording) -
     context = CheckContext(drive, None)
     assert [count(context), count(context)] == [1, 1]
     assert count(dataclasses.replace(context, recording=drive)) == 2
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_dead_side_is_the_only_finding(drive: Recording, side: str) -> None:
+    """And not also the scale of wheels that it brings about."""
+    assert drive.wheels is not None
+    speed = drive.wheels.speed * np.where([side in name for name in drive.wheels.names], 0.0, 1.0)
+    wheels = dataclasses.replace(drive.wheels, speed=speed, angle_rad=None)
+    log = dataclasses.replace(drive, wheels=wheels, truth=None, truth_channels=())
+    (finding,) = run_checks(log)
+    assert (finding.code, finding.channel) == ("dead", "wheels")
+    assert finding.what == f"the {side} side stands throughout"
+
+
+def test_what_another_finding_brings_about_waits_for_its_repair(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = [("wheel-radius", "wheels"), ("stuck", "imu"), ("gaps", "gnss"), ("stuck", "gnss")]
+
+    def found(count: int) -> list[str]:
+        findings = [Finding(code, "error", channel, "", "", "") for code, channel in kinds[:count]]
+        monkeypatch.setattr(run, "CHECKS", (lambda context: iter(findings),))
+        return [finding.code for finding in run_checks(drive)]
+
+    assert found(1) == ["wheel-radius"]
+    assert found(4) == ["stuck", "gaps", "stuck"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import get_types_from_msg
 
 from terrafusion.datasets.checks import repair
-from terrafusion.datasets.core.channels import Imu, Magnetometer
+from terrafusion.datasets.core.channels import Fix, Imu, Magnetometer
 from terrafusion.datasets.core.conventions import turned_as_mounted
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
@@ -24,7 +25,18 @@ from terrafusion.datasets.readers.ros.topics import ACKERMANN_STAMPED, ODOMETRY,
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from tests.datasets.ros_bags import MAKE2, ROS2, T0, Message, imu_messages, odometry_messages, write_ros2
+from tests.datasets.ros_bags import (
+    MAKE1,
+    MAKE2,
+    ROS1,
+    ROS2,
+    T0,
+    Message,
+    imu_messages,
+    odometry_messages,
+    write_ros1,
+    write_ros2,
+)
 
 JOINTS = "sensor_msgs/msg/JointState"
 NAMES = ["left_wheel_joint", "right_wheel_joint"]
@@ -125,6 +137,84 @@ def test_odometry_without_numbers_until_the_hardware_answers_is_left_out(tmp_pat
     assert recording.wheels is not None
     assert recording.wheels.t_ns.tolist() == [t for _, _, t, _ in messages[3:]]
     assert f"wheels: 3 of {len(messages)} messages of /odom hold no number; left out" in recording.notes
+
+
+GPS_FIX = """std_msgs/Header header
+{package}/GPSStatus status
+float64 latitude
+float64 longitude
+float64 altitude
+float64 track
+float64 speed
+float64 climb
+float64 pitch
+float64 roll
+float64 dip
+float64 time
+float64 gdop
+float64 pdop
+float64 hdop
+float64 vdop
+float64 tdop
+float64 err
+float64 err_horz
+float64 err_vert
+float64 err_track
+float64 err_speed
+float64 err_climb
+float64 err_time
+float64 err_pitch
+float64 err_roll
+float64 err_dip
+float64[9] position_covariance
+uint8 position_covariance_type
+"""
+GPS_STATUS = """std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source
+"""
+
+
+@pytest.mark.parametrize("kind", ["ROS 1", "mcap", "sqlite3 without definitions"])
+def test_fixes_with_speed_and_track_are_read(kind: str, tmp_path: Path) -> None:
+    package = "gps_common" if kind == "ROS 1" else "gps_msgs"
+    store, make = (ROS1, MAKE1) if kind == "ROS 1" else (ROS2, MAKE2)
+    fix, status = f"{package}/msg/GPSFix", f"{package}/msg/GPSStatus"
+    for name, text in ((status, GPS_STATUS), (fix, GPS_FIX.format(package=package))):
+        store.register(get_types_from_msg(text, name))
+    messages = imu_messages(make, n=5)
+    for k, t in enumerate(TIMES):
+        seen, header = np.arange(k % 3, dtype=np.int32), make.header(t, "gps")
+        about = make.new(status, header, 1, seen, 2, seen, seen, seen, seen, 20, 1, 1, 1)
+        numbers = [48.0, 11.0 + 1e-5 * k, 500.0, 90.0, 1.5 * (k > 0), 0.0, *np.zeros(13), 0.392, *np.zeros(5)]
+        covariance = np.diag([0.25, 0.36, 4.0]).ravel()
+        messages.append(("/gps", fix, t, make.new(fix, header, about, *numbers, covariance, 2)))
+    bag = (write_ros1 if kind == "ROS 1" else write_ros2)(
+        tmp_path / "run.bag", messages, *([StoragePlugin.SQLITE3] if kind.startswith("sqlite3") else [])
+    )
+    if kind.startswith("sqlite3"):
+        with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database:
+            database.execute("update message_definitions set encoded_message_definition = ''")
+            database.commit()
+    gnss = open_recording(bag).gnss
+    assert gnss is not None
+    assert gnss.velocity_enu_mps is not None
+    assert gnss.sigma_v_mps is not None
+    np.testing.assert_allclose(gnss.velocity_enu_mps[1:, :2], [[1.5, 0.0]] * (len(TIMES) - 1), atol=1e-12)
+    assert np.isnan(gnss.velocity_enu_mps[0]).all()  # live, nothing tells rest from a speed that is not set
+    np.testing.assert_allclose(gnss.sigma_v_mps, 0.2)
+    np.testing.assert_allclose(gnss.sigma_enu_m, [[0.5, 0.6, 2.0]] * len(TIMES))
+    assert set(gnss.fix.tolist()) == {Fix.FLOAT}
+    assert gnss.enu_m[-1, 0] == pytest.approx(74.56e-2 * (len(TIMES) - 1), rel=1e-3)
 
 
 def test_fixes_of_a_type_that_is_not_read_are_named(tmp_path: Path) -> None:

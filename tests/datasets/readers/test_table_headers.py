@@ -7,6 +7,7 @@ import pytest
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.text.proposed_map import starter_map
 from tests.datasets.readers.test_table import GYRO_MAP, table
@@ -99,6 +100,107 @@ def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
     path.write_text("t_s,speed_mps\n0,1\n", encoding="utf-16")
     with pytest.raises(DataError, match=r"excel\.csv: is text in UTF-16; save it as UTF-8"):
         open_recording(path)
+
+
+def proposed(folder: Path, text: str) -> Recording:
+    path = table(folder, text, None)
+    with pytest.raises(DataError) as told:
+        open_recording(path)
+    path.with_name("drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
+    return open_recording(path)
+
+
+def test_a_line_of_units_below_the_header_is_proposed(tmp_path: Path) -> None:
+    rows = "0 sec,90,7.2,--\n0.5 sec,N/A,null,1\n"
+    recording = proposed(tmp_path, f"Time,GyroZ,Speed,AccZ\n[s],[deg/s],km/h,[g]\n\n{rows}")
+    assert recording.imu is not None
+    assert recording.wheels is not None
+    np.testing.assert_allclose(recording.imu.gyro_radps[:, 2], [np.pi / 2, np.nan])
+    np.testing.assert_array_equal(recording.imu.accel_mps2[:, 2], [np.nan, 9.80665])
+    assert recording.wheels.speed.tolist() == [[2.0]]
+    assert "the line below the header holds units; left out" in recording.notes
+
+
+@pytest.mark.parametrize(("lat", "lon"), [("4807.5,S", "01130.0,W"), ("48.125,S", "11.5,W")])
+def test_hemispheres_and_degrees_with_minutes_are_proposed(lat: str, lon: str, tmp_path: Path) -> None:
+    text = f"t,Lat,NS,Lon,EW,gz\n0,,,,,1\n1,{lat},{lon},1\n2,{lat},{lon},1\n"
+    recording = proposed(tmp_path, text)
+    assert recording.datum is not None
+    assert recording.datum[:2] == (-48.125, -11.5)
+    assert recording.gnss is not None
+    assert len(recording.gnss) == 2
+    (tmp_path / "drive.csv").write_text(text.replace(",W,", ",X,"))
+    with pytest.raises(DataError, match="column 'EW' is 'X'; give N, S, E or W"):
+        open_recording(tmp_path / "drive.csv")
+
+
+def test_minutes_are_below_sixty(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"column 'Lat' is 4877\.5: no minutes"):
+        proposed(tmp_path, "t,Lat,Lon,gz\n1,4807.5,01130.0,1\n2,4877.5,01130.0,1\n")
+
+
+AS_EXPORTED = {
+    "PX4 IMU": (
+        "sensor_combined_0.csv",
+        "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0]",
+        "6000000,0,0,1,2\n6004000,0,0,1,2",
+        'time: {column: "timestamp", unit: us, epoch: none}, channels: {imu: {gyro_x_radps: "gyro_rad[0]", '
+        'gyro_y_radps: "gyro_rad[1]", gyro_z_radps: "gyro_rad[2]", accel_x_mps2: "accelerometer_m_s2[0]"}}',
+    ),
+    "PX4 GPS": (
+        "vehicle_gps_position_0.csv",
+        "timestamp,lat,lon,alt,vel_m_s,cog_rad",
+        "6000000,481000000,115000000,500000,1,0\n6200000,481000000,115000000,500000,1,0",
+        'time: {column: "timestamp", unit: us, epoch: none}, channels: {gnss: {latitude_deg: {column: "lat", '
+        'unit: "1e-7 deg"}, longitude_deg: {column: "lon", unit: "1e-7 deg"}, '
+        'height_m: {column: "alt", unit: mm}}}',
+    ),
+    "phone's gyroscope": (
+        "Gyroscope.csv",
+        "seconds_elapsed,z,y,x",
+        "0.01,3,2,1\n0.02,3,2,1",
+        'channels: {imu: {gyro_z_radps: "z", gyro_y_radps: "y", gyro_x_radps: "x"}}',
+    ),
+    "phyphox": (
+        "Accelerometer.csv",
+        '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)","Acceleration z (m/s^2)"',
+        "0.01,3,2,1\n0.02,3,2,1",
+        'imu: {accel_x_mps2: "Acceleration x (m/s^2)", accel_y_mps2: "Acceleration y (m/s^2)", ',
+    ),
+    "phone's receiver": (
+        "Location.csv",
+        "time,speed,bearing,longitude,latitude",
+        "1600000000000000000,1,0,11,48\n1600000001000000000,1,0,11,48",
+        'unit: ns, epoch: unix}, channels: {gnss: {longitude_deg: "longitude", latitude_deg: "latitude"}}',
+    ),
+    "odometry, whose place is no truth": (
+        "odometry.csv",
+        "time,x,y,theta,v,w",
+        "0.1,1,2,0,1,0.1\n0.2,1,2,0,1,0.1",
+        'channels: {wheels: {speed_mps: "v", yaw_rate_radps: "w"}}',
+    ),
+    "Arduino": (
+        "log.csv",
+        "millis,v_left,v_right",
+        "10,1,1\n60,1,1",
+        'time: {column: "millis", unit: ms, epoch: none}, channels: {wheels: {left_mps: "v_left", ',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", AS_EXPORTED)
+def test_exports_of_autopilots_and_phones_are_proposed(case: str, tmp_path: Path) -> None:
+    name, header, rows, expected = AS_EXPORTED[case]
+    (tmp_path / name).write_text(f"{header}\n{rows}\n")
+    with pytest.raises(DataError) as told:
+        open_recording(tmp_path / name)
+    assert expected in str(told.value)
+
+
+def test_a_sigma_of_the_height_that_is_not_given_is_twice_the_horizontal_one(tmp_path: Path) -> None:
+    recording = proposed(tmp_path, "t,lat,lon,alt,hAcc\n0,48,11,500,0.5\n1,48,11,500,0.7\n")
+    assert recording.gnss is not None
+    assert recording.gnss.sigma_enu_m.tolist() == [[0.5, 0.5, 1.0], [0.7, 0.7, 1.4]]
 
 
 @pytest.mark.parametrize("names", ["t,left,right", "t,left_wheel,right_wheel", "t;wheel_l;wheel_r"])

@@ -135,6 +135,10 @@ CLOCKS = {
     "date and time of day": ("Date,Time", "2020-09-13,23:59:59.75", "2020-09-14,00:00:00.25"),
     "with points and commas": ("Datum;Uhrzeit", "13.9.2020;23:59:59,75", "14.9.2020;0:00:00,25"),
     "day first": ("id;time", "7;13.09.2020 23:59:59,75", "8;14.09.2020 00:00:00,25"),
+    "United States": ("time", "9/13/2020 11:59:59.75 PM", "9/14/2020 12:00:00.25 am"),
+    "slashes, day first": ("time", "13/09/2020 23:59:59.75 UTC", "14/09/2020 00:00:00.25 UTC"),
+    "MATLAB": ("Time", "13-Sep-2020 23:59:59.75", "14-Sep-2020 00:00:00.25"),
+    "offset behind a blank": ("time", "2020-09-14 01:59:59.75 +0200", "2020-09-14 02:00:00.25 +0200"),
     "GPS week and seconds": ("GPS Week,TOW [s]", "2123,86417.75", "2123,86418.25"),
     "GPS week and milliseconds": ("week,iTOW", "2123,86417750", "2123,86418250"),
 }
@@ -149,6 +153,12 @@ def test_times_in_two_columns_or_of_a_day_are_proposed(kind: str, tmp_path: Path
     assert imu is not None
     assert imu.t_ns.tolist() == [MIDNIGHT_NS - 250_000_000, MIDNIGHT_NS + 250_000_000]
     assert imu.gyro_radps[:, 2].tolist() == [0.5, 0.25]
+
+
+@pytest.mark.parametrize("date", ["05/01/2020 12:00:00", "13/13/2020 12:00:00", "1-Foo-2020 12:00:00"])
+def test_a_date_that_is_not_clear_is_refused(date: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"column 'time' is '{date}' in row 1.*nothing tells day and month"):
+        opened_as_proposed(tmp_path, f"time,gyro_z\n{date},1\n")
 
 
 def test_a_column_that_gives_all_rows_one_time_is_refused(tmp_path: Path) -> None:
