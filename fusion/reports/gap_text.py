@@ -27,7 +27,8 @@ TITLE = 9  # columns of a section's title
 
 
 def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = None) -> list[str]:
-    """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next.
+    """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next;
+    the last says how many were left out.
 
     `out` is the folder of the files, `corrected` the vehicle file that was written.
     """
@@ -35,7 +36,8 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
         lines = _screen(d, out, corrected, most)
         if len(lines) <= LINES:
             break
-    return lines[:LINES]
+    more = len(lines) - LINES + 1
+    return lines if more < 2 else [*lines[: LINES - 1], f"... and {more} lines more, in the report"]
 
 
 def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.fusion.reports.gap_text import _shrinks, explanation, numbers, verdict_line
+from terrafusion.fusion.reports import gap_text
+from terrafusion.fusion.reports.gap_text import LINES, _shrinks, answer, explanation, numbers, verdict_line
 from terrafusion.twin.gap.answer.verdict import Cause, CredibleSet, GapVerdict
 from terrafusion.twin.gap.data.candidates import Candidates
 
@@ -66,3 +67,14 @@ def test_a_cause_that_removes_no_error_for_sure_is_doubted(
     verdict = SimpleNamespace(named=("mass",), left=left)
     answer: Any = SimpleNamespace(shrinkage=shrink, verdict=verdict, runs=("a", "b"))
     assert ("doubt the cause" in _shrinks(answer, 3)[0]) == doubted
+
+
+@pytest.mark.parametrize("more", [0, 1, 7])
+def test_a_screen_that_is_cut_says_so(more: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = [f"line {i}" for i in range(LINES + more)]
+    monkeypatch.setattr(gap_text, "_screen", lambda *_: whole)
+    diagnosis: Any = None
+    screen = answer(diagnosis)
+    assert len(screen) == LINES
+    assert screen[:-1] == whole[: LINES - 1]
+    assert screen[-1] == (f"... and {more + 1} lines more, in the report" if more else whole[-1])

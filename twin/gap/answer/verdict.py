@@ -108,8 +108,10 @@ def judge(
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}
     best = most_probable(sets, found.evidence)
+    likely = detected and unknown <= UNKNOWN  # else what is left is nearly even over the whole catalogue
     classes = {
-        effect: credible_members(effect, best, sets, found.alike) for effect in (best if detected else ())
+        effect: credible_members(effect, best, sets, found.alike) if likely else (effect,)
+        for effect in (best if detected else ())
     }
     credible = credible_sets(classes, sets) if detected else []
     causes = _causes(found, sets, best, classes, candidates, head)
@@ -121,8 +123,8 @@ def judge(
         return GapVerdict("unknown", (), causes, loose, p_null, p_unknown, None)
     named = tuple(c.effect for c in causes if c.effect in best)
     kind = "ambiguous" if any(len(members) > 1 for members in classes.values()) else "effect"
-    likely = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
-    kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
+    alone = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
+    kind = "parameters" if alone == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
     return GapVerdict(
         kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best)
