@@ -70,8 +70,10 @@ def verdict_line(d: GapDiagnosis) -> str:
     limited = d.drives is not None and d.drives.limits()
     if verdict.kind == "no_gap":
         if d.detection.p_value <= d.significance:
-            other = "do the drives" if limited else "does the ground, which varies more along the path"
-            return f"Undecided: the runs differ from the references, and so {other} ({_test(d)})."
+            other = "and so do the drives" if limited else "but no effect differs from zero for sure"
+            if not limited and d.evidence.patchier is not None:
+                other = "and so does the ground, which varies more along the path"
+            return f"Undecided: the runs differ from the references, {other} ({_test(d)})."
         if d.drives is not None and limited:
             covered = f"which cover {percent(d.drives.covered)} of the time of these drives"
             return f"No gap as far as the references tell, {covered} ({_test(d)})."

@@ -24,6 +24,15 @@ def test_a_set_of_most_effects_names_none() -> None:
     assert verdict_line(answer).startswith(expected)
 
 
+def test_a_gap_beside_effects_of_about_no_size_is_undecided() -> None:
+    detection, evidence = SimpleNamespace(p_value=0.017), SimpleNamespace(patchier=None)
+    verdict = GapVerdict("no_gap", (), [], [], 0.2, 0.0, None)
+    answer: Any = SimpleNamespace(
+        verdict=verdict, drives=None, detection=detection, evidence=evidence, significance=0.05
+    )
+    assert verdict_line(answer).startswith("Undecided: the runs differ from the references, but no effect")
+
+
 @pytest.mark.parametrize(
     ("effect", "value", "text"),
     [
