@@ -128,8 +128,11 @@ def diagnose_evidence(
     drives = drive_coverage(runs, evidence.references, evidence.model)
     limited = drives is not None and drives.limits()
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
-    verdict = withheld(verdict, detection.p_value, significance, drives, evidence.patchier is not None)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit, explanation.left_out)
+    verdict = verdict.refuted() if verdict.named and shrunk.nothing_removed() else verdict
+    verdict = withheld(verdict, detection.p_value, significance, drives, evidence.patchier is not None)
+    if verdict.fit is None:
+        shrunk = shrinkage(judged, sigma, robot, None, explanation.left_out)
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
     return GapDiagnosis(
