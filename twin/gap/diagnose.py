@@ -105,8 +105,9 @@ def diagnose_evidence(
     candidates, runs, notes = evidence.candidates, evidence.runs, list(evidence.notes)
     # null: how scores scatter where nothing has changed
     uncalibrated = len(evidence.references) < FEWEST
-    imu = evidence.model.vehicle.sensors.imu if uncalibrated else None
-    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates, imu))
+    sheet = initial_state_sigma(candidates, evidence.model.vehicle.sensors.imu)
+    first = sheet if uncalibrated else initial_state_sigma(candidates)
+    sigma = learn_state_sigma(evidence.references, first, sheet)
     scores = [score(run, sigma) for run in runs]
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
