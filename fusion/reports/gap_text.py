@@ -255,6 +255,8 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
         how = f"by {100.0 * s.share:.0f} %{interval} with it in the twin, {data}"
         if s.interval is not None and s.interval[0] <= 0.0:
             how += ", perhaps not at all: doubt the cause"
+        elif (s.share if s.interval is None else s.interval[1]) < 1.0 - MOST_LEFT:
+            how += "; most of it is left, so there is another cause, or another law"
     order = sorted(s.physical, key=lambda name: -abs(s.channels[name][0] - s.channels[name][1]))
     parts = []
     for name in order[:most]:

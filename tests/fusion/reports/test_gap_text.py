@@ -87,3 +87,17 @@ def test_a_screen_that_is_cut_says_so(more: int, monkeypatch: pytest.MonkeyPatch
     assert len(screen) == LINES
     assert screen[:-1] == whole[: LINES - 1]
     assert screen[-1] == (f"... and {more + 1} lines more, in the report" if more else whole[-1])
+
+
+@pytest.mark.parametrize(
+    ("share", "interval", "said"),
+    [(0.2, (0.14, 0.26), True), (0.2, None, True), (0.2, (0.1, 0.9), False), (0.9, None, False)],
+)
+def test_a_cause_that_leaves_most_of_the_gap_is_not_alone(
+    share: float, interval: tuple[float, float] | None, said: bool
+) -> None:
+    """Of a lateral centre of gravity and a scale of encoders, the first was named, with 98 %."""
+    shrink = SimpleNamespace(floor=1.0, share=share, interval=interval, physical={}, channels={})
+    verdict = SimpleNamespace(named=("mass",), left=0.1)
+    answer: Any = SimpleNamespace(shrinkage=shrink, verdict=verdict, runs=("a", "b"))
+    assert ("another cause" in _shrinks(answer, 3)[0]) == said
