@@ -27,7 +27,8 @@ TITLE = 9  # columns of a section's title
 
 
 def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = None) -> list[str]:
-    """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next.
+    """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next;
+    the last says how many were left out.
 
     `out` is the folder of the files, `corrected` the vehicle file that was written.
     """
@@ -35,7 +36,8 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
         lines = _screen(d, out, corrected, most)
         if len(lines) <= LINES:
             break
-    return lines[:LINES]
+    more = len(lines) - LINES + 1
+    return lines if more < 2 else [*lines[: LINES - 1], f"... and {more} lines more, in the report"]
 
 
 def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:
@@ -68,8 +70,10 @@ def verdict_line(d: GapDiagnosis) -> str:
     limited = d.drives is not None and d.drives.limits()
     if verdict.kind == "no_gap":
         if d.detection.p_value <= d.significance:
-            other = "do the drives" if limited else "does the ground, which varies more along the path"
-            return f"Undecided: the runs differ from the references, and so {other} ({_test(d)})."
+            other = "and so do the drives" if limited else "but no effect differs from zero for sure"
+            if not limited and d.evidence.patchier is not None:
+                other = "and so does the ground, which varies more along the path"
+            return f"Undecided: the runs differ from the references, {other} ({_test(d)})."
         if d.drives is not None and limited:
             covered = f"which cover {percent(d.drives.covered)} of the time of these drives"
             return f"No gap as far as the references tell, {covered} ({_test(d)})."
@@ -251,6 +255,8 @@ def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
         how = f"by {100.0 * s.share:.0f} %{interval} with it in the twin, {data}"
         if s.interval is not None and s.interval[0] <= 0.0:
             how += ", perhaps not at all: doubt the cause"
+        elif (s.share if s.interval is None else s.interval[1]) < 1.0 - MOST_LEFT:
+            how += "; most of it is left, so there is another cause, or another law"
     order = sorted(s.physical, key=lambda name: -abs(s.channels[name][0] - s.channels[name][1]))
     parts = []
     for name in order[:most]:

@@ -142,12 +142,19 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     wanted = np.stack([_between(t_s, twist[:, i], grid, limits[i]) for i in range(2)], axis=1)
     commanded = Commanded(wanted, np.zeros(2) if _rests(recording, vehicle) else wanted[0])
     # Rare commands hold until the next one.
-    gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
+    interval_s = sample_interval_s(t_s)
+    rare = interval_s > 0.5 * LONGEST_GAP_S
+    gaps = np.zeros((0, 2)) if rare else _gaps(t_s)
     notes = [
         f"the commands have {counted(len(gaps), 'gap')} of up to {np.diff(gaps).max():.1f} s, in which "
         "nothing is compared and the last command is held"
     ] if len(gaps) else []  # fmt: skip
-    step_s = min(sample_interval_s(t_s), LONGEST_GAP_S)
+    if rare:
+        notes.append(
+            f"the commands are {interval_s:.2g} s apart, and each is taken to hold until the next: if the "
+            "robot was commanded more often, give a log with all commands, or --input wheels"
+        )
+    step_s = min(interval_s, LONGEST_GAP_S)
     return TwinInput(start, commanded.sides(vehicle), commanded, gaps, tuple(notes), step_s)
 
 

@@ -105,8 +105,9 @@ def diagnose_evidence(
     candidates, runs, notes = evidence.candidates, evidence.runs, list(evidence.notes)
     # null: how scores scatter where nothing has changed
     uncalibrated = len(evidence.references) < FEWEST
-    imu = evidence.model.vehicle.sensors.imu if uncalibrated else None
-    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates, imu))
+    sheet = initial_state_sigma(candidates, evidence.model.vehicle.sensors.imu)
+    first = sheet if uncalibrated else initial_state_sigma(candidates)
+    sigma = learn_state_sigma(evidence.references, first, sheet)
     scores = [score(run, sigma) for run in runs]
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
@@ -128,8 +129,11 @@ def diagnose_evidence(
     drives = drive_coverage(runs, evidence.references, evidence.model)
     limited = drives is not None and drives.limits()
     verdict = judge(detection, significance, explanation, candidates, other_drives=limited)
-    verdict = withheld(verdict, detection.p_value, significance, drives, evidence.patchier is not None)
     shrunk = shrinkage(judged, sigma, robot, verdict.fit, explanation.left_out)
+    verdict = verdict.refuted() if verdict.named and shrunk.nothing_removed() else verdict
+    verdict = withheld(verdict, detection.p_value, significance, drives, evidence.patchier is not None)
+    if verdict.fit is None:
+        shrunk = shrinkage(judged, sigma, robot, None, explanation.left_out)
     where = gap_map(judged, sigma, robot, significance, seed)
     following = planner.next_run(verdict)
     return GapDiagnosis(

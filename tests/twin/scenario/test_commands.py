@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -60,3 +62,14 @@ def test_a_log_drives_the_twin_as_the_robot_was_driven(robot: str, drive: str) -
     )
     driven = setup.drive("auto").inputs[:, :2]
     assert np.sqrt(np.mean((own - driven) ** 2)) < 0.02  # rad/s
+
+
+@pytest.mark.parametrize(("every", "noted"), [(1, False), (50, True)])
+def test_commands_that_a_log_holds_seldom_are_noted(every: int, noted: bool) -> None:
+    """Thinned, they drove the twin in steps that the robot was never commanded, without a word."""
+    vehicle = load_vehicle("elevate")
+    log = simulate("demo", vehicle=vehicle)
+    assert log.command is not None
+    some = {f.name: getattr(log.command, f.name)[::every] for f in dataclasses.fields(log.command)}
+    found = twin_input(dataclasses.replace(log, command=type(log.command)(**some)), vehicle, "command")
+    assert any("hold until the next" in note for note in found.notes) == noted

@@ -20,6 +20,7 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 METRIC = "mean squared whitened error with soil, offsets and pose adapted, on runs left out of the fit"
 ABOVE_FLOOR = 3.0  # standard deviations of the floor (assumed) above which a gap has a share
+NOTHING = 0.1  # share of the gap (assumed) that an effect removes at least, if it is a cause
 FREE = 10.0  # factor on theta's 1 sigma where it alone is recalibrated (assumed: nearly free)
 
 
@@ -50,6 +51,12 @@ class Shrinkage:
     physical: dict[str, tuple[float, float, float | None]]
     errors_after: list[Array]
     errors_before: list[Array]
+
+    def nothing_removed(self) -> bool:
+        """Whether the twin with the effect is, with 95 % confidence, as far from runs left out of the fit; or
+        a single run from the one it was fitted to."""
+        most = self.share if self.interval is None else self.interval[1]
+        return most is not None and most < NOTHING
 
 
 def own_error(run: WhitenedRun, robot: RobotOffsets) -> Array:

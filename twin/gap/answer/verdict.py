@@ -82,8 +82,23 @@ class GapVerdict:
         explained = self.kind != "unknown" and self.log_odds >= 0.0 and (self.left or 0.0) <= MOST_LEFT
         if (significant and explained) or (sure and self.kind == "unknown"):
             return self
+        return self.undecided()
+
+    def undecided(self) -> Self:
+        """Without a gap that could be named."""
         loose = [dataclasses.replace(s, named=False) for s in self.sets]
         return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)
+
+    def refuted(self) -> Self:
+        """An unknown cause, where the twin with the named effects is as far from the runs as without: the
+        likelihood only compares effects, with noise as loud as the best of them leaves."""
+        share, p_effect = 1.0 - CREDIBLE, 1.0 - self.p_null - self.p_unknown
+        causes = [dataclasses.replace(c, probability=share * c.probability) for c in self.causes]
+        sets = [dataclasses.replace(s, probability=share * s.probability, named=False) for s in self.sets]
+        return dataclasses.replace(
+            self, kind="unknown", named=(), causes=causes, sets=sets, fit=None,
+            p_unknown=self.p_unknown + (1.0 - share) * p_effect,
+        )  # fmt: skip
 
 
 def null_probability(p_value: float) -> float:
@@ -108,8 +123,10 @@ def judge(
     scale = (1.0 - p_null) * (1.0 - unknown) / sum(sets.values())
     sets = {name: scale * p for name, p in sets.items()}
     best = most_probable(sets, found.evidence)
+    likely = detected and unknown <= UNKNOWN  # else what is left is nearly even over the whole catalogue
     classes = {
-        effect: credible_members(effect, best, sets, found.alike) for effect in (best if detected else ())
+        effect: credible_members(effect, best, sets, found.alike) if likely else (effect,)
+        for effect in (best if detected else ())
     }
     credible = credible_sets(classes, sets) if detected else []
     causes = _causes(found, sets, best, classes, candidates, head)
@@ -121,12 +138,25 @@ def judge(
         return GapVerdict("unknown", (), causes, loose, p_null, p_unknown, None)
     named = tuple(c.effect for c in causes if c.effect in best)
     kind = "ambiguous" if any(len(members) > 1 for members in classes.values()) else "effect"
-    likely = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
-    kind = "parameters" if likely == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
+    alone = credible_members(SOIL_STRENGTH, best, sets, {}) if best == (SOIL_STRENGTH,) else ()
+    kind = "parameters" if alone == (SOIL_STRENGTH,) else kind  # whatever it resembles, the runs exclude
     odds = log_odds(found, len(candidates.effects))
-    return GapVerdict(
-        kind, named, causes, credible, p_null, p_unknown, found.fits[best], odds, found.left.get(best)
+    fit = found.fits[best]
+    verdict = GapVerdict(kind, named, causes, credible, p_null, p_unknown, fit, odds, found.left.get(best))
+    surely = odds > math.log(CREDIBLE / (1.0 - CREDIBLE))  # as of a limit that acts beyond a size
+    return (
+        verdict if surely or any(map(_differs_from_zero, fit.values, fit.covariance)) else verdict.undecided()
     )
+
+
+def _differs_from_zero(value: Array, covariance: Array) -> bool:
+    """Whether the 95 % confidence region of a law's sizes (k,) leaves zero out; those of a law that is
+    simulated are one."""
+    from scipy.special import chdtri
+
+    freedom = np.linalg.matrix_rank(covariance, hermitian=True)
+    square = value @ np.linalg.pinv(covariance, hermitian=True) @ value
+    return bool(square > chdtri(freedom, 1.0 - CREDIBLE))
 
 
 def most_probable(sets: Mapping[Sets, float], evidence: Mapping[Sets, float]) -> Sets:

@@ -17,25 +17,47 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 EM_STEPS = 6
 PRIOR_RUNS = 3.0  # weight of the assumed variance of a state, in runs (assumed)
+REFUTED = 0.05  # chance of states as alike below which a data sheet's 1 sigma is too large for this robot
 LEAST_SIGMA = 0.03  # least 1 sigma of a state, as a share of its unit (assumed)
 
 
-def learn_state_sigma(references: Sequence[WhitenedRun], first: Array) -> Array:
+def learn_state_sigma(references: Sequence[WhitenedRun], first: Array, sheet: Array | None = None) -> Array:
     """1 sigma (T,) of the states about their mean over the references, by expectation-maximisation (Dempster,
-    Laird and Rubin 1977) from the first 1 sigma (T,) on, which fewer than two references leave as it is."""
+    Laird and Rubin 1977) from the first 1 sigma (T,) on, which fewer than two references leave as it is.
+
+    A larger one of the data sheet (T,) holds until the references refute it: three may be alike by chance.
+    """
     sigma, count = first.copy(), len(references)
     if count < 2:
         return sigma
-    robot = first_offsets([score(run, first) for run in references], references[0].residuals.effects)
-    rests = [_without_offsets(run, robot) for run in references]
+    rests = _rests(references, first)
     for _ in range(EM_STEPS):
-        spread = [np.linalg.inv(rest[:-1, :-1] + np.diag(sigma**-2.0)) for rest in rests]
-        means = np.array([H @ rest[:-1, -1] for H, rest in zip(spread, rests, strict=True)])
-        observed = np.square(means - means.mean(axis=0)).sum(axis=0)
-        observed += (count - 1) / count * np.sum([np.diag(H) for H in spread], axis=0)
-        variance = (PRIOR_RUNS * first**2 + observed) / (PRIOR_RUNS + count - 1)
+        variance = (PRIOR_RUNS * first**2 + _observed(rests, sigma)) / (PRIOR_RUNS + count - 1)
         sigma = np.maximum(np.sqrt(variance), LEAST_SIGMA * first)
-    return sigma
+    if sheet is None or not (sheet > first).any():
+        return sigma
+    from scipy.special import chdtr
+
+    square = _observed(_rests(references, sheet), sheet) / sheet**2
+    holds = (sheet > first) & (chdtr(count - 1, square) >= REFUTED)
+    return np.asarray(np.where(holds, np.maximum(sigma, sheet), sigma))
+
+
+def _rests(references: Sequence[WhitenedRun], sigma: Array) -> list[Array]:
+    """Of each run (T + 1, T + 1), with the robot's offsets beside states of so many sigma (T,)."""
+    robot = first_offsets([score(run, sigma) for run in references], references[0].residuals.effects)
+    return [_without_offsets(run, robot) for run in references]
+
+
+def _observed(rests: Sequence[Array], sigma: Array) -> Array:
+    """Expected sum (T,) of the squares of states, of so many sigma (T,), about their mean."""
+    count = len(rests)
+    spread = [np.linalg.inv(rest[:-1, :-1] + np.diag(sigma**-2.0)) for rest in rests]
+    means = np.array([H @ rest[:-1, -1] for H, rest in zip(spread, rests, strict=True)])
+    return np.asarray(
+        np.square(means - means.mean(axis=0)).sum(axis=0)
+        + (count - 1) / count * np.sum([np.diag(H) for H in spread], axis=0)
+    )
 
 
 def _without_offsets(run: WhitenedRun, robot: RobotOffsets) -> Array:

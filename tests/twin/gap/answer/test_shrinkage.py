@@ -10,7 +10,7 @@ import pytest
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.gap.answer import shrinkage
-from terrafusion.twin.gap.answer.shrinkage import _share
+from terrafusion.twin.gap.answer.shrinkage import Shrinkage, _share
 from terrafusion.twin.gap.infer.refit import RunWithEffects
 
 
@@ -21,6 +21,20 @@ def test_share_is_between_zero_and_one(after: float, share: float) -> None:
     assert found == pytest.approx(share)
     assert interval is not None
     assert 0.0 <= interval[0] <= interval[1] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("share", "interval", "nothing"),
+    [
+        (0.0, (0.0, 0.02), True), (0.0, (0.0, 0.97), False), (0.2, (0.14, 0.26), False), (0.0, None, True),
+        (0.6, None, False), (None, None, False),
+    ],
+)  # fmt: skip
+def test_an_effect_removes_nothing_where_its_interval_holds_hardly_more(
+    share: float | None, interval: tuple[float, float] | None, nothing: bool
+) -> None:
+    found = Shrinkage(135.0, 141.0, 0.9, share, interval, 100.0, {}, {}, [], [])
+    assert found.nothing_removed() == nothing
 
 
 def test_an_effect_is_tried_on_the_references_soil_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,3 +35,14 @@ def test_the_scatter_is_that_of_the_state(bias: float, scale: float) -> None:
 
 def test_one_reference_leaves_the_first_sigma() -> None:
     assert learn_state_sigma(runs(1, 1.0, 0.0), np.array([0.5])) == pytest.approx([0.5])
+
+
+@pytest.mark.parametrize(("count", "bias", "sigma"), [(3, 0.4, 1.5), (3, 0.01, 0.4), (30, 0.4, 0.4)])
+def test_a_data_sheet_s_sigma_holds_until_the_references_refute_it(
+    count: int, bias: float, sigma: float
+) -> None:
+    """The accelerometers of three runs of a Husky were alike, and the next an `accel_bias`."""
+    found = learn_state_sigma(runs(count, bias, 0.0), np.array([0.5]), np.array([1.5]))
+    assert found == pytest.approx(sigma, rel=0.3)
+    unchanged = learn_state_sigma(runs(count, bias, 0.0), np.array([0.5]), np.array([0.5]))
+    assert unchanged == learn_state_sigma(runs(count, bias, 0.0), np.array([0.5]))
