@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shlex
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from terrafusion.datasets.catalog.catalog import load_catalog
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.cli import demo
 from terrafusion.fusion.cli.main import app
+from terrafusion.twin import simulate as simulation
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
@@ -48,6 +50,17 @@ def run_python(document: Path, line: int, code: str, session: dict[str, Any]) ->
     exec(compile("\n" * (line - 1) + code, str(document), "exec"), session)
 
 
+def cut_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drives of the twin are cut off: what a page shows does not hang on how long they are."""
+    whole = simulation.simulate_run
+
+    def first_part(*given: Any, **more: Any) -> simulation.SimulatedRun:
+        run = whole(*given, **more)
+        return dataclasses.replace(run, recording=until(run.recording, seconds))
+
+    monkeypatch.setattr(simulation, "simulate_run", first_part)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_report: None) -> Path:
     """An empty folder to work in. Reports have tests of their own and cost a third of the time: left out."""
@@ -77,8 +90,9 @@ def test_readme(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (folder / "results" / "metrics.json").is_file()
 
 
-def test_tutorial(folder: Path) -> None:
+def test_tutorial(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One session from top to bottom."""
+    cut_after(105.0, monkeypatch)
     document = ROOT / "docs" / "tutorials" / "tutorial.md"
     session: dict[str, Any] = {"__name__": "tutorial"}
     for line, language, text in blocks(document):
@@ -92,8 +106,9 @@ def test_tutorial(folder: Path) -> None:
     assert abs(session["state"].slip) < 1.0
 
 
-def test_a_gap_is_found_and_closed(folder: Path) -> None:
+def test_a_gap_is_found_and_closed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The commands of the tutorial end as it says."""
+    cut_after(60.0, monkeypatch)
     document = ROOT / "docs" / "tutorials" / "close-a-gap.md"
     printed = [run_command(line) for _, _, text in blocks(document) for line in text.splitlines()]
     assert [text.startswith("Gap caused by wheel_radius (") for text in printed[-2:]] == [True, False]
@@ -103,8 +118,9 @@ def test_a_gap_is_found_and_closed(folder: Path) -> None:
 @pytest.mark.parametrize(
     "document", [d for d in DOCUMENTS if d.is_relative_to(ROOT / "docs")], ids=lambda d: d.name
 )
-def test_python_of_the_other_documents(document: Path, folder: Path) -> None:
+def test_python_of_the_other_documents(document: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every block that a reader sees as Python is run; the tutorial has a test of its own."""
+    cut_after(75.0, monkeypatch)
     session: dict[str, Any] = {"__name__": document.stem}
     python = [(line, text) for line, language, text in blocks(document) if language == "python"]
     assert len(python) == document.read_text(encoding="utf-8").count("```python")

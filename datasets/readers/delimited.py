@@ -147,6 +147,8 @@ def read_text(path: Path) -> bytes:
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             packed = os.fstat(file.fileno()).st_size
+            if path.suffix != ".gz" and packed > limits.TEXT_BYTES + len(BOM):
+                raise _too_large()
             most = min(limits.FREE_BYTES + limits.EXPANSION * packed, limits.TEXT_BYTES) + 1
             read = bytearray()
             try:
@@ -172,10 +174,14 @@ def read_text(path: Path) -> bytes:
     return CutText(data) if cut else data
 
 
+def _too_large() -> DataError:
+    return limits.too_much("MB", limits.TEXT_BYTES / 2**20, "split it, or convert it to Parquet")
+
+
 def _check_size(data: bytes, packed: int) -> None:
     """Refuse more bytes, rows or bytes in a line than a text file may have."""
     if len(data) > limits.TEXT_BYTES:
-        raise limits.too_much("MB", limits.TEXT_BYTES / 2**20, "split it, or convert it to Parquet")
+        raise _too_large()
     limits.check_expansion(len(data), packed)
     if max(data.count(b"\n"), data.count(b"\r")) > limits.ROWS:
         raise limits.too_much("lines", limits.ROWS)

@@ -16,6 +16,7 @@ most `wheel_wait_s` and one step behind the IMU.
 import bisect
 import dataclasses
 import math
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -39,18 +40,22 @@ class Propagator:
         self._until_ns = 0
         self._count = 0
         self._measured: gtsam.PreintegratedCombinedMeasurements
+        self._now: State
 
     def carry(self, state: State, covariance: Array, imu: ImuStream, noise: SensorNoise) -> State:
         """The state at the newest IMU sample, with `covariance` (dim, dim) of the keyframe propagated.
 
         Slip, terrain, status and biases stay those of the keyframe, the angular velocity is that of the
-        newest sample. With no sample after the keyframe this is `state` itself.
+        newest sample. With no sample after the keyframe this is `state` itself. Asked again before anything
+        new has come, as for the other frame, it is a copy.
         """
         newest_ns = imu.t_ns[-1]
         if newest_ns <= state.t_ns:
             return state
         if self._state is not state or self._taken(imu) != self._count:
             self._begin(state, covariance, noise)
+        elif newest_ns == self._until_ns:
+            return _copied(self._now)
         segments = imu.segments(self._until_ns, newest_ns)
         if not imu.six_axis:
             segments = with_centripetal_force(segments, self._key)
@@ -63,7 +68,8 @@ class Propagator:
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
         if segments:
             self._gyro = segments[-1].gyro_radps
-        return self._carried(state, self._gyro, density / math.sqrt(interval_s))
+        self._now = self._carried(state, self._gyro, density / math.sqrt(interval_s))
+        return _copied(self._now)
 
     def _taken(self, imu: ImuStream) -> int:
         """Number of samples between keyframe and `_until_ns`: it changes when a late one comes."""
@@ -95,6 +101,14 @@ class Propagator:
             angular_velocity_radps=self._key.rate(gyro_radps),
             **covariance_fields(P, R, velocity, gyro_sigma_radps),
         )
+
+
+def _copied(state: State) -> State:
+    """With arrays of its own: they belong to the caller."""
+    arrays: dict[str, Any] = {
+        name: value.copy() for name, value in vars(state).items() if isinstance(value, np.ndarray)
+    }
+    return dataclasses.replace(state, **arrays)
 
 
 def transition(

@@ -26,6 +26,8 @@ from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import Scenario
 from terrafusion.twin.simulate import simulate
 
+pytestmark = pytest.mark.usefixtures("checked_once")
+
 SCENARIO = """\
 description: straights, turns both ways, a stop, a stretch in reverse
 drive:

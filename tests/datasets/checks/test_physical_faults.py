@@ -16,6 +16,8 @@ from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
+pytestmark = pytest.mark.usefixtures("checked_once")
+
 START_NS = 1_700_000_000_000_000_000
 SECONDS, REST_S = 90.0, 6.0
 RADIUS_M, TRACK_M, EFFECTIVE_TRACK_M = 0.1651, 0.555, 0.9

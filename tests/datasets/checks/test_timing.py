@@ -29,6 +29,9 @@ CODES = {
 }  # fmt: skip
 
 
+pytestmark = pytest.mark.usefixtures("checked_once")
+
+
 def found_in(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     """The findings on clocks and signals; the others have tests of their own."""
     return [finding for finding in run_checks(recording, rig) if finding.code in CODES]

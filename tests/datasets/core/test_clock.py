@@ -100,7 +100,7 @@ def test_the_period_is_that_of_the_place() -> None:
     np.testing.assert_array_equal(repaired, t)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10**6), reach=st.integers(1, 20), share=st.sampled_from([0.05, 1.0]))
 @example(seed=0, reach=5, share=1.0)
 def test_disorder_is_sorted_not_shifted(seed: int, reach: int, share: float) -> None:

@@ -325,7 +325,8 @@ def test_empty_and_header_only(tmp_path: Path) -> None:
         open_recording(tmp_path / "imu_00.csv")
 
 
-def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
+def test_a_huge_file_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.datasets.readers.delimited.bytearray", pytest.fail, raising=False)
     with (tmp_path / "imu_00.csv").open("wb") as file:
         file.write(IMU_HEADER.encode() + b"\n")
         file.truncate(600 << 20)  # sparse: takes no room on the disk

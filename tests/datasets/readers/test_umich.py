@@ -211,7 +211,8 @@ def test_a_file_of_too_many_lines_is_refused(trial: Path, monkeypatch: pytest.Mo
         open_recording(trial / FAMILY[0])
 
 
-def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
+def test_a_huge_file_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.datasets.readers.delimited.bytearray", pytest.fail, raising=False)
     with (tmp_path / "x_imu.txt").open("wb") as file:
         file.write(b"1652300000.0 0 0 0 0 0 9.8\n")
         file.truncate(600 << 20)  # sparse: takes no room on the disk

@@ -166,7 +166,7 @@ def recordings(draw: st.DrawFn, latest_ns: int) -> Recording:
 
 
 CHECKED = settings(
-    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+    deadline=None, max_examples=80, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
 
 

@@ -13,6 +13,7 @@ import pytest
 
 import terrafusion as tf
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.benchmark.outage_plan import until
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +118,8 @@ def test_an_effect_may_be_named_alone() -> None:
 
 
 def test_a_diagnosis_says_and_writes_its_answer(tmp_path: Path) -> None:
-    references = [tf.simulate("circle", seed=seed) for seed in range(3)]
-    run = tf.simulate("circle", seed=9, effects={"slope": 0.05})
+    references = [until(tf.simulate("circle", seed=seed), 45.0) for seed in range(3)]
+    run = until(tf.simulate("circle", seed=9, effects={"slope": 0.05}), 45.0)
     answer = tf.diagnose(run, references=references, vehicle="elevate", effects=["slope", "mass"])
     assert answer.detected
     assert "slope" in answer.summary()

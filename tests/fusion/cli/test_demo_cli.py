@@ -106,21 +106,21 @@ def test_its_log_can_be_read_again(demo: tuple[Path, str]) -> None:
 def test_several_drives_run_twice_into_the_same_folder(
     tmp_path: Path, terrafusion, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    """The first 30 s of each drive are enough for that."""
+    """The first 22 s of each drive are enough for that."""
 
     @functools.cache
     def short(name: str, seed: int) -> Recording:
-        return until(simulate(name, seed=seed), 30.0)
+        return until(simulate(name, seed=seed), 22.0)
 
     monkeypatch.setattr(simulation, "simulate", short)
-    monkeypatch.setattr(module, "OUTAGE_START_S", 18.0)
-    monkeypatch.setattr(module, "OUTAGE_S", 8.0)
+    monkeypatch.setattr(module, "OUTAGE_START_S", 13.0)
+    monkeypatch.setattr(module, "OUTAGE_S", 6.0)
     estimates = []
     for drives in (2, 1):
         if drives == 1:  # the pages of a drive have been written by then
             request.getfixturevalue("no_report")
         outcome = terrafusion("demo", "--out", tmp_path / "out", "--drives", drives, "--jobs", "1")
         assert (outcome.status, outcome.err) == (0, "")
-        assert outcome.out.startswith(f"{drives} drives of 30 s over asphalt")
+        assert outcome.out.startswith(f"{drives} drives of 22 s over asphalt")
         estimates.append((tmp_path / "out" / "fixed" / "estimate.csv").read_bytes())
     assert estimates[0] == estimates[1]

@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
@@ -33,7 +34,7 @@ def nees(result: ReplayResult) -> dict[str, float]:
 @pytest.mark.parametrize("terrain", ["grass", "medium_sand"])
 @pytest.mark.parametrize("fixes", [True, False])
 def test_wheels_carry_the_robot_through_a_gap_of_the_imu(terrain: str, fixes: bool) -> None:
-    run = with_gap(simulate("figure_eight", vehicle="elevate", terrain=terrain, seed=1))
+    run = until(with_gap(simulate("figure_eight", vehicle="elevate", terrain=terrain, seed=1)), 75.0)
     outages = [] if fixes else [Outage(BEGIN_S, SECONDS + 5.0)]
     result = replay(run, mode="fixed", outages=outages)
     assert not any("heading was wrong" in note for note in result.estimate.notes)
@@ -49,7 +50,8 @@ def test_wheels_carry_the_robot_through_a_gap_of_the_imu(terrain: str, fixes: bo
 def test_wheels_that_do_not_skid_turn_the_robot_by_what_they_say() -> None:
     """Of a differential drive: those of a robot that skids say twice as much."""
     vehicle = with_overrides(load_vehicle("elevate"), Overrides(drive="differential"))
-    run, rig = with_gap(simulate("figure_eight", vehicle="elevate", terrain="asphalt", seed=1)), vehicle.rig()
+    drive = until(simulate("figure_eight", vehicle="elevate", terrain="asphalt", seed=1), 62.0)
+    run, rig = with_gap(drive), vehicle.rig()
     assert run.truth is not None
     assert run.truth.twist_body is not None
     u, r = run.truth.twist_body[:, 0], run.truth.twist_body[:, -1]

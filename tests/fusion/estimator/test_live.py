@@ -21,7 +21,7 @@ from terrafusion.twin.simulate import simulate
 
 @pytest.fixture(scope="module")
 def drive() -> Recording:
-    return until(simulate("figure_eight", terrain="asphalt", seed=5), 50.0)
+    return until(simulate("figure_eight", terrain="asphalt", seed=5), 30.0)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from terrafusion.datasets.core.messages import (
     WheelSample,
 )
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.inputs.streams import MOST_INCOMPLETE
@@ -61,7 +62,7 @@ def test_a_driver_that_warms_up_for_long_is_no_other_imu() -> None:
 
 def test_an_imu_of_one_axis_has_to_be_declared() -> None:
     """As six axes are expected, it would give no estimate, without a word."""
-    log = simulate("figure_eight", terrain="asphalt", seed=1)
+    log = until(simulate("figure_eight", terrain="asphalt", seed=1), 40.0)
     assert log.imu is not None
     gyro = log.imu.gyro_radps.copy()
     gyro[:, :2] = np.nan

@@ -10,6 +10,7 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -76,7 +77,7 @@ def test_without_fixes_the_place_keeps_its_shift_and_moves_on_with_the_heading()
 
 @pytest.fixture(scope="module")
 def on_time() -> Recording:
-    return simulate("figure_eight", terrain="asphalt", seed=300)
+    return until(simulate("figure_eight", terrain="asphalt", seed=300), 85.0)
 
 
 def late(run: Recording, delay_s: float) -> Recording:
@@ -120,7 +121,7 @@ def test_the_ellipses_hold_an_antenna_that_is_only_assumed(
         sensors=dataclasses.replace(vehicle.sensors, gnss=gnss),
         robot=dataclasses.replace(vehicle.robot, antenna_m=KnownNumber(wrong, known)),
     )
-    result = replay(on_time, vehicle=vehicle)
+    result = replay(until(on_time, 25.0), vehicle=vehicle)
     errors = result.scores.errors
     assert errors is not None
     begin = errors.t_ns < on_time.start_ns + 10_000_000_000

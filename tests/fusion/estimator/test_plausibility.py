@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
@@ -105,7 +106,7 @@ def test_a_burst_of_fixes_elsewhere_does_not_move_the_pose(
     def burst(t: np.ndarray, enu: np.ndarray) -> np.ndarray:
         return enu + ((t > 30.0) & (t < 30.0 + lasts_s))[:, None] * off_m
 
-    result = run(changed(burst), mode)
+    result = run(until(changed(burst), 48.0), mode)
     assert result.error_m.max() < 0.5
     assert BEYOND in result.reasons()
     assert "doubtful" in result.status()

@@ -9,6 +9,7 @@ import pytest
 
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.inputs.streams import longest_gap_s, usual_interval_s
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
@@ -43,7 +44,7 @@ def test_an_outage_with_slow_sensors_is_as_good_as_the_sensors(rate_hz: float) -
 @pytest.mark.parametrize(("rate_hz", "planar"), [(5, True), (10, True), (17, True), (20, False)])
 def test_accelerations_of_a_slow_imu_do_not_carry_the_robot_away(rate_hz: int, planar: bool) -> None:
     """Every so many samples of 100 Hz, as a throttled topic has them: each with its vibration in full."""
-    run = simulate("figure_eight", terrain="asphalt", seed=1)
+    run = until(simulate("figure_eight", terrain="asphalt", seed=1), 76.0)
     assert run.imu is not None
     slow = dataclasses.replace(run, imu=run.imu.select(slice(0, None, round(100 / rate_hz))))
     result = replay(slow, outages=[Outage(40.0, 30.0)])

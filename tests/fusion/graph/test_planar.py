@@ -44,12 +44,12 @@ REDUCED = ("gyro z", "no accelerometer", "no imu", "body speed")
 
 @pytest.fixture(scope="module")
 def exact() -> Recording:
-    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 50.0)
+    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 35.0)
 
 
 @pytest.fixture(scope="module")
 def noisy() -> Recording:
-    return until(simulate("waypoints", terrain="medium_sand", seed=3), 60.0)
+    return until(simulate("waypoints", terrain="medium_sand", seed=3), 45.0)
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +326,7 @@ def test_the_command_on_a_reduced_log_folder(exact: Recording, tmp_path: Path, w
 
     from terrafusion.fusion.cli.main import app
 
-    log = write_log_folder(reduced(until(exact, 50.0), what), tmp_path / "log")
+    log = write_log_folder(reduced(exact, what), tmp_path / "log")
     result = CliRunner().invoke(app, ["replay", str(log), "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())

@@ -317,7 +317,7 @@ CALLS = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.lists(st.tuples(CALLS, TIMES), min_size=1, max_size=3))
 def test_whatever_comes_is_used_left_out_or_a_data_error(
     running: Running, calls: list[tuple[tuple[Any, ...], Any]]

@@ -26,7 +26,7 @@ from terrafusion.twin.simulate import simulate
 
 @pytest.fixture(scope="module")
 def exact() -> Recording:
-    return simulate("figure_eight", terrain="asphalt", noiseless=True)
+    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 60.0)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,8 @@ def mixed() -> Recording:
 
 @pytest.fixture(scope="module")
 def short(mixed: Recording) -> Recording:
-    """Its first 75 s, asphalt and sand: what happens before does not depend on what comes after."""
-    return until(mixed, 75.0)
+    """Its first 60 s, asphalt and sand: what happens before does not depend on what comes after."""
+    return until(mixed, 60.0)
 
 
 @pytest.fixture(scope="module")
@@ -73,11 +73,8 @@ def test_exact_data_give_exact_estimates(exact: Recording, batch: bool) -> None:
     assert scores.velocity_rmse_mps < 0.006
 
 
-@pytest.mark.parametrize(("angle_rad", "shift_m"), [(2.0, (0.0, 0.0)), (-2.9, (350.0, -900.0))])
-def test_start_pose_and_heading_do_not_matter(
-    short: Recording, replayed: ReplayResult, angle_rad: float, shift_m: tuple[float, float]
-) -> None:
-    here, there = replayed.scores, replay(turned(short, angle_rad, shift_m)).scores
+def test_start_pose_and_heading_do_not_matter(short: Recording, replayed: ReplayResult) -> None:
+    here, there = replayed.scores, replay(turned(short, -2.9, (350.0, -900.0))).scores
     assert here.ate_m is not None
     assert there.ate_m == pytest.approx(here.ate_m, rel=0.02, abs=1e-3)
 
@@ -113,7 +110,7 @@ def test_an_outage_is_bridged_and_left_without_a_jump(mixed: Recording) -> None:
 
 def test_slip_is_seen_where_the_ground_gives_way() -> None:
     """Loose sand on 5 deg: the slip state follows the twin's true slip while GNSS is there."""
-    recording = until(simulate("paper_profile", terrain="loose_sand", slope_deg=5.0, seed=3), 150.0)
+    recording = until(simulate("paper_profile", terrain="loose_sand", slope_deg=5.0, seed=3), 90.0)
     estimate = replay(recording).estimate
     truth, wheels = recording.truth, recording.wheels
     assert truth is not None

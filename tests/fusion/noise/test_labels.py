@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.noise.labels import GroundLabels
@@ -37,7 +38,7 @@ def test_labels_that_do_not_fit_their_times_are_refused(times, names) -> None:
 
 
 def test_the_estimator_takes_the_row_of_the_label() -> None:
-    recording = simulate("figure_eight", terrain="loose_sand", seed=1)
+    recording = until(simulate("figure_eight", terrain="loose_sand", seed=1), 45.0)
     labels = GroundLabels((START_NS,), ("loose_sand",))
     told = replay(recording, settings={"labels": labels}).estimate
     after = told.trajectory.t_ns > told.trajectory.t_ns[0]
@@ -48,7 +49,7 @@ def test_the_estimator_takes_the_row_of_the_label() -> None:
 
 
 def test_a_label_that_the_wheels_contradict_is_not_followed_for_long() -> None:
-    recording = simulate("figure_eight", terrain="loose_sand", seed=1)
+    recording = until(simulate("figure_eight", terrain="loose_sand", seed=1), 45.0)
     told = replay(recording, settings={"labels": LABELS}).estimate
     after = told.trajectory.t_ns > SWITCH_NS
     assert (told.dominant_terrain()[after] != "asphalt").mean() > 0.9

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.cli.replay import summary
 from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult, replay
@@ -49,6 +50,7 @@ def test_metrics_and_screen_tell_the_correction(moved: ReplayResult) -> None:
 
 
 def test_without_self_calibration_nothing_is_told() -> None:
-    run = replay(simulate("straight", terrain="asphalt", seed=3), settings={"self_calibrate": False})
+    drive = until(simulate("straight", terrain="asphalt", seed=3), 20.0)
+    run = replay(drive, settings={"self_calibrate": False})
     assert run.learned == ()
     assert metrics_of(run)["calibration"] == []

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Terrain
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.estimator.messages import arguments_of
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
@@ -46,7 +47,7 @@ def test_the_truth_is_not_shown_to_the_estimator(source: str) -> None:
 
 
 def test_a_camera_in_the_log_reaches_the_weights() -> None:
-    recording = simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=5)
+    recording = until(simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=5), 40.0)
     t_ns = recording.start_ns + np.arange(10, dtype=np.int64) * 10**9
     seen = Terrain(t_ns, np.array(["mud"] * 10), "camera", ("mud",), np.ones((10, 1)))
     estimate = replay(dataclasses.replace(recording, terrain=seen)).estimate

@@ -49,13 +49,13 @@ def whole_sand() -> Recording:
 
 @pytest.fixture(scope="module")
 def sand(whole_sand: Recording) -> Recording:
-    return until(whole_sand, 50.0)
+    return until(whole_sand, 42.0)
 
 
 @pytest.fixture(scope="module")
 def exact() -> Recording:
-    """Its first minute has turns both ways, and changes of speed."""
-    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 60.0)
+    """Its first 40 s have turns both ways, and changes of speed."""
+    return until(simulate("figure_eight", terrain="asphalt", noiseless=True), 40.0)
 
 
 def run(recording: Recording, method: str, **options: object) -> ReplayResult:
@@ -151,8 +151,8 @@ def test_exact_data_give_exact_estimates(exact: Recording, method: str) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_same_input_gives_the_same_bits(sand: Recording, method: str) -> None:
-    begin = until(sand, 31.0)
-    first, again = (run(begin, method, outages=[Outage(20.0, 10.0)]).estimate for _ in range(2))
+    begin = until(sand, 20.0)
+    first, again = (run(begin, method, outages=[Outage(12.0, 6.0)]).estimate for _ in range(2))
     assert first.trajectory.position_m.tobytes() == again.trajectory.position_m.tobytes()
     assert first.changes == again.changes
 
@@ -264,7 +264,7 @@ def test_the_shipped_tuning_was_made_from_these_drives() -> None:
 def test_tuning_never_makes_the_training_loss_worse() -> None:
     """A search keeps what helps, however long the drive is."""
     lesson = Training("figure_eight", "mud", 0.0, 1002).lesson()
-    drives = [Lesson(until(lesson.recording, 31.0), Outage(20.0, 10.0))]
+    drives = [Lesson(until(lesson.recording, 17.0), Outage(11.0, 5.0))]
     tuned = tune(drives, ModeTuning(), ["fixed"])
     assert loss(drives, "fixed", tuned) <= loss(drives, "fixed", ModeTuning())
 
@@ -298,7 +298,7 @@ def test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot() -> None:
 
 def test_on_firm_ground_adaptive_is_as_good_as_fixed() -> None:
     """A robot that the model does not know, on a firm winding drive: its grounds slip alike."""
-    log = until(simulate("figure_eight", vehicle="warthog", terrain="asphalt", seed=2), 75.0)
+    log = until(simulate("figure_eight", vehicle="warthog", terrain="asphalt", seed=2), 62.0)
     outage = [Outage(40.0, 20.0)]
     one, other = (replay(log, mode=mode, outages=outage).scores.outages[0] for mode in ("adaptive", "fixed"))
     assert one.end_error_m is not None

@@ -77,14 +77,21 @@ def exciting() -> np.ndarray:
 
 
 def drive(
-    values: dict[str, float], sides: np.ndarray, terrain: str = "loose_sand", start: np.ndarray | None = None
+    values: dict[str, float],
+    sides: np.ndarray,
+    terrain: str = "loose_sand",
+    start: np.ndarray | None = None,
+    every: int = 1,
 ) -> tuple[np.ndarray, ...]:
-    """States, inputs and outputs of a drive, from rest by default, in the graph of all effects."""
+    """States, inputs and outputs of a drive, from rest by default, in the graph of all effects.
+
+    All rows are integrated, `every` so many-th is returned.
+    """
     effects = dict.fromkeys(KEYS, NAMED) | values
     own = plant(terrain, effects)
     inputs = delayed_inputs(sides, DT_S, values.get("dead_time/transport", 0.0))
     x0 = np.zeros(len(STATES)) if start is None else start
-    states = integrate(x0, inputs, DT_S, own)
+    states, inputs = integrate(x0, inputs, DT_S, own)[::every], inputs[::every]
     return states, inputs, measured(states, inputs, own.vehicle, soil(terrain), MOUNTING, effects)
 
 

@@ -339,13 +339,12 @@ def kinetic_j(x: np.ndarray) -> np.ndarray:
     return 0.5 * (moving + ELEVATE.wheel.inertia_kgm2 * (x[:, state_slice("wheel_speed")] ** 2).sum(axis=1))
 
 
-def signature(values: dict[str, float], sides: np.ndarray) -> np.ndarray:
-    """What an effect changes in the readings of a drive, in units of noise.
+def signature(values: dict[str, float], sides: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """What an effect changes in the `plain` readings of a drive, every 5th row, in units of noise.
 
     Positions less the integral of the velocities: the rest of a motion's change is in these.
     """
-    rows = slice(None, None, 5)
-    change = (drive(values, sides)[2] - drive({}, sides)[2])[rows]
+    change = drive(values, sides, every=5)[2] - plain
     moved = np.zeros((len(change), 2))
     velocity = change[:, [Y["gnss_v_e_mps"], Y["gnss_v_n_mps"]]]
     moved[1:] = np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * 5 * DT_S, axis=0)
@@ -358,7 +357,8 @@ def signature(values: dict[str, float], sides: np.ndarray) -> np.ndarray:
 def test_the_forms_of_an_effect_differ_beyond_their_size(effect) -> None:
     """Correlation of their signatures below 0.999, each of them seen; torque is limited in steps only."""
     sides = np.tile(DRIVES["step"], (10, 1)) if effect == "torque_limit" else exciting()
-    forms = [signature(at(form, "scale"), sides) for form in FORMS if form.effect == effect]
+    without = drive({}, sides, every=5)[2]
+    forms = [signature(at(form, "scale"), sides, without) for form in FORMS if form.effect == effect]
     for one, other in itertools.combinations(forms, 2):
         sizes = np.linalg.norm(one), np.linalg.norm(other)
         assert min(sizes) > 0.5

@@ -142,7 +142,8 @@ def test_it_settles_at_the_speed_the_motors_allow() -> None:
 
 def test_half_the_step_changes_little_and_half_of_that_less() -> None:
     """First order: the difference falls by about two with the step, and is small at the default."""
-    runs = [simulate([spec()], substeps=k)[0] for k in (4, 8, 16)]
+    drive = (Segment(0.5), Segment(1.5, 1.0), Segment(1.5, 0.8, 0.5), Segment(1.0, 0.0, -0.8))
+    runs = [simulate([spec(drive=drive)], substeps=k)[0] for k in (4, 8, 16)]
     first, second = (
         max(np.abs(a["x"] - b["x"]).max(), np.abs(a["y"] - b["y"]).max()) for a, b in itertools.pairwise(runs)
     )
