@@ -118,11 +118,14 @@ class Policy:
         return mean, sigma, slope, time_s
 
     def blend(
-        self, probabilities: ArrayLike, grade: float = 0.0, slips: tuple[Array, Array, Array] | None = None
+        self,
+        probabilities: ArrayLike,
+        grade: float = 0.0,
+        slips: tuple[Array, Array, Array, Array] | None = None,
     ) -> SensorNoise:
         """The moment-matched noise for class probabilities (k,) that sum to one, at a grade.
 
-        `slips`: mean, 1 sigma and correlation time (k,) of the slip of the classes, where not the policy's.
+        `slips`: those of the classes, as `slips()` gives them, where not the policy's.
 
         Slip and yaw scale have the mean and the variance of the mixture (law of total variance: mean of
         the variances plus variance of the means); the other errors have zero mean in every class, so their
@@ -131,7 +134,7 @@ class Policy:
         p, table = np.asarray(probabilities, dtype=float), self._table
         if slips is not None:
             table = table.copy()
-            table[:, _SLIP_MEAN], table[:, _SLIP_SIGMA], table[:, _SLIP_TIME] = slips
+            table[:, [_SLIP_MEAN, _SLIP_SIGMA, _SLIP_PER_GRADE, _SLIP_TIME]] = np.column_stack(slips)
         mean = p @ table
         variance = p @ table**2
         expected = table[:, _SLIP_MEAN] + grade * table[:, _SLIP_PER_GRADE]

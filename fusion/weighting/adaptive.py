@@ -114,9 +114,7 @@ class TerrainNoise:
         """Take over the slope of the slip over the grade, on ground that no class describes."""
         if not self.adaptive:
             self.noise = dataclasses.replace(self.noise, slip_per_grade=per_grade)
-        elif self._starts_pooled:
-            pooled = dataclasses.replace(self.policy.classes[UNKNOWN], slip_per_grade=per_grade)
-            self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: pooled})
+        else:
             self._ground_slip.per_grade = per_grade
 
     def learned_grounds(self) -> GroundMemory | None:
@@ -311,11 +309,12 @@ class TerrainNoise:
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
             return
-        p, (mean, sigma) = self._probabilities, self._slips
+        p, (mean, sigma), slope = self._probabilities, self._slips, self.policy.slips()[2]
         if self._starts_pooled:
             unknown, own = np.arange(len(mean)) == self._unknown, self._ground_slip
             mean, sigma = np.where(unknown, own.mean, mean), np.where(unknown, own.sigma, sigma)
-        self.noise = self.policy.blend(self._shares, self._grade, (mean, sigma, self._slip_times_s))
+            slope = np.where(unknown, own.per_grade, slope)
+        self.noise = self.policy.blend(self._shares, self._grade, (mean, sigma, slope, self._slip_times_s))
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = vars(self._recorded), vars(self.noise)

@@ -30,7 +30,7 @@ def test_without_evidence_it_is_the_policys_to_the_last_bit() -> None:
     assert mean.tolist() == PRIOR.tolist()
     assert sigma.tolist() == PRIOR_SIGMA.tolist()
     mixed = np.full(len(PRIOR), 1.0 / len(PRIOR))
-    assert POLICY.blend(mixed, 0.1) == POLICY.blend(mixed, 0.1, (mean, sigma, TIME_S))
+    assert POLICY.blend(mixed, 0.1) == POLICY.blend(mixed, 0.1, (mean, sigma, PER_GRADE, TIME_S))
 
 
 def test_the_longer_a_ground_is_driven_the_more_its_own_slip_counts() -> None:
@@ -99,6 +99,7 @@ def test_learned_slip_survives_a_dump(robot: str) -> None:
         weights._driven.add(ON_SAND, 0.3, 0.01, 0.0, 200.0)
         weights._slips = weights._driven.posterior()
     else:
+        weights.learn_grade_slip(0.1)
         weights.learn_slip(0.07, 0.05, 0.3, 0)
     restored = Estimator.restore(config, estimator.dump()).weights
     for one in (weights, restored):

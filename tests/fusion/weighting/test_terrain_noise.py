@@ -102,11 +102,14 @@ def test_a_label_rules_over_changes_among_grounds_that_the_robot_found(label: st
 def test_slip_that_the_robot_shows_is_that_of_ground_no_class_describes(robot: str) -> None:
     fixed, adaptive = noise_of(robot, mode="fixed"), noise_of(robot)
     for weights in (fixed, adaptive):
+        weights.learn_grade_slip(0.1)
         weights.learn_slip(0.3, 0.07, 0.2, 5)
+    assert fixed.noise.slip_per_grade == 0.1
     assert (fixed.noise.slip_mean, fixed.noise.slip_sigma, fixed.noise.slip_time_s) == (0.3, 0.07, 0.2)
     knows_its_grounds = robot == "elevate"
     assert (adaptive.noise.slip_mean == pytest.approx(0.3)) != knows_its_grounds
     assert (adaptive.noise.slip_sigma == pytest.approx(0.07)) != knows_its_grounds
+    assert (adaptive.noise.slip_per_grade == pytest.approx(0.1)) != knows_its_grounds
     assert adaptive.noise.slip_time_s == pytest.approx(0.2), "of all grounds"
 
 
@@ -215,9 +218,8 @@ def test_a_label_without_credit_leaves_what_the_detector_makes_of_the_ground(rob
 def test_noise_begins_on_the_level() -> None:
     weights = noise_of("elevate")
     weights.begin(0)
-    mean, sigma, _, time_s = weights.policy.slips()
     p = np.array(list(weights.posterior().values()))
-    assert weights.noise == weights.policy.blend(p, 0.0, (mean, sigma, time_s))
+    assert weights.noise == weights.policy.blend(p, 0.0, weights.policy.slips())
 
 
 def test_grounds_are_learned_where_no_model_knows_them_or_a_memory_is_given() -> None:
