@@ -141,7 +141,7 @@ class MountingAngle:
         if len(self._windows) < BLOCK:
             return False
         self._add_block(np.array(self._windows))
-        self._windows, self._up = [], LEVEL_START
+        self.interrupt()
         return True
 
     def _add_block(self, windows: Complex) -> None:
