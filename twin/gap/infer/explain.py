@@ -32,9 +32,6 @@ FIRST, BESIDE, TRIED = 12, 5, 4
 """Laws that get a close look: the best alone, and the best beside each of the best few."""
 SECOND, GROWTH = 18, 3.0
 """Best laws alone that get a second look, and the factor from a best size to the next one simulated there."""
-REFINEMENTS, FAR = 3, 0.05
-"""Most further simulations at best sizes, and the share by which a size differs from all simulated ones: half
-of how wrong a law of motion is (`head.yaml`)."""
 WEIGHINGS = 2  # of channels
 LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
@@ -139,25 +136,6 @@ class _Explainer:
             points += [SimulatedSize(law, x, soils) for x in new]
         return look.bank.with_sizes(self.evidence, points)
 
-    def refined(self, bank: SignatureBank, index: Collection[int]) -> _Look:
-        """At the bank, simulated anew where the best size of a law is still far from any simulated one, there
-        and half-way to the next ones: on a convex law, the chord to a larger size makes it too small."""
-        look = self.look(bank)
-        left = [i for i in index if look.laws.names[i] in bank.signatures]
-        for first in (True, *[False] * (REFINEMENTS - 1)):
-            _, values, _ = look.laws.best(look.metric)
-            points = dict[int, list[float]]()
-            for i, x in ((i, float(values[i][0])) for i in left):
-                known = look.bank.sizes(look.laws.names[i])
-                apart = known[np.abs(known - x) > FAR * abs(x)]
-                if len(apart) == len(known) or not first:
-                    next_ = apart[apart < x][-1:], apart[apart > x][:1]
-                    points[i] = [x, *(0.5 * (x + float(end)) for end in np.concatenate(next_))]
-            if not points:
-                break
-            left, look = list(points), self.look(self.with_best_sizes(look, points))
-        return look
-
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
         basis = np.arange(len(self.evidence.candidates.keys), m.shared - self.robot.misfit)
@@ -213,15 +191,15 @@ def explain(
     # The most promising laws alone, simulated where no size is near the best one.
     sizes = own.promising(look, alone, FIRST)
     bank = own.with_best_sizes(look, sizes).only(look.laws.names[i] for i in sizes)
-    return _close_look(own, own.refined(bank, sizes), tuple(sizes), alone)
+    return _close_look(own, bank, tuple(sizes), alone)
 
 
 def _close_look(
-    own: _Explainer, look: _Look, index: tuple[int, ...], alone: Mapping[int, Fitted]
+    own: _Explainer, bank: SignatureBank, index: tuple[int, ...], alone: Mapping[int, Fitted]
 ) -> Explanation:
     """Promising laws, by index, alone and in pairs, with their discrepancies; `alone` are fits of all laws
     without it."""
-    evidence, bank = own.evidence, look.bank
+    evidence, look = own.evidence, own.look(bank)
     _, values, used = look.laws.best(look.metric)
     wanted, weight = {i: used[i] for i in index}, np.ones(len(evidence.channels))
     size = {i: float(np.linalg.norm(values[i])) for i in index}

@@ -33,13 +33,12 @@ def explained(
     [
         ("soil_strength/shear", ("motion_resistance", "wheel_radius"), 0.9, 0.1),
         ("imu_time_offset/shift", ("gyro_bias", "gyro_scale"), 0.3, 0.015),
-        ("drivetrain_friction/efficiency", ("torque_limit",), 0.4, 0.04),  # currents grow as 1 / (1 - e)
     ],
 )
 def test_a_large_effect_is_found_at_its_size(
     key: str, others: tuple[str, ...], truth: float, within: float
 ) -> None:
-    """4.5 typical sizes of the ground's strength, an IMU 15 of them late, four of a gear's loss."""
+    """4.5 typical sizes of the ground's strength, and an IMU 15 of them late."""
     name = key.split("/")[0]
     found, candidates = explained([name, *others], {key: truth})
     singles = {effects: value for effects, value in found.evidence.items() if len(effects) == 1}
