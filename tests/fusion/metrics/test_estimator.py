@@ -128,7 +128,8 @@ def test_slip_is_seen_where_the_ground_gives_way() -> None:
 def test_fixed_weights_do_not_change(short: Recording) -> None:
     estimate = replay(short, mode="fixed").estimate
     assert not estimate.changes
-    learned = ("slip_mean", "slip_per_grade", "slip_sigma", "slip_time_s")  # the robot's own, by self-calibration
+    # The slip is the robot's own, by self-calibration.
+    learned = ("slip_mean", "slip_per_grade", "slip_sigma", "slip_time_s")
     assert all(np.ptp(series) == 0.0 for name, series in estimate.weights.items() if name not in learned)
 
 
