@@ -154,9 +154,11 @@ def drift_finding(recording: Recording, drifts: dict[motion.Pair, Drift], steady
     """The finding on the clock that drifts, which is none of those that are `steady` with another."""
     names = {name for pair in drifts for name in pair}
     names = names - steady or names
-    told = any(_agree(_longer(recording, pair), 1.0 / drift.scale - 1.0) for pair, drift in drifts.items())
+    by_durations = any(
+        _agree(_longer(recording, pair), 1.0 / drift.scale - 1.0) for pair, drift in drifts.items()
+    )
     # An IMU counts its samples itself (assumed); the times of the others are mostly those of the computer.
-    name = "imu" if "imu" in names and not told else _odd_duration(recording, names)
+    name = "imu" if "imu" in names and not by_durations else _odd_duration(recording, names)
     pair = min((p for p in drifts if name in p), key=lambda p: drifts[p].spread)
     drift = drifts[pair] if name == pair[1] else drifts[pair].reversed()
     scaled = dataclasses.replace(drift, offset_s=0.0)  # an offset is a later finding

@@ -99,7 +99,7 @@ def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
 def iso_dates(texts: Sequence[str]) -> list[str]:
     """Dates and times without blanks around as in ISO 8601, where one of them tells how they are meant.
 
-    3.9.2020 has the day first, 3-Sep-2020 names the month; with slashes that is told by a date of the column
+    3.9.2020 has the day first, 3-Sep-2020 names the month; with slashes that shows in a date of the column
     such as 9/13/2020. A date that is not understood stays as it is.
     """
     plain = [text.strip().replace(",", ".") for text in texts]
