@@ -1,5 +1,6 @@
 """The numbers of a robot while it drives: a step of the smoother every few seconds, in slices."""
 
+import dataclasses
 import statistics
 from collections import deque
 from collections.abc import Sequence
@@ -9,8 +10,8 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.fit import combined, started
 from terrafusion.fusion.calibration.motion import MotionSegment, dead_reckoned, node_due
-from terrafusion.fusion.calibration.numbers import Knowledge
-from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
+from terrafusion.fusion.calibration.numbers import GYRO_BIAS, Knowledge
+from terrafusion.fusion.calibration.reduction import BIAS, NODE, Nodes, Noise, Reduction
 
 STEP_S = 4.0
 """Time between the begins of steps while the robot drives."""
@@ -66,8 +67,7 @@ class SelfCalibration:
 
     def restart(self, known: Knowledge | None = None) -> None:
         """Begin a new stretch, as the path was interrupted; from `known` if what came since is wrong."""
-        if known is not None:
-            self.known = known
+        self.known = self._wandered(self.known) if known is None else known
         self.before = self.known
         if self._start_ns is not None:
             self._begin()
@@ -153,9 +153,19 @@ class SelfCalibration:
         self._far = FAR_MISFIT < work.misfit < BETTER * self._step_misfit
         self._step_misfit = work.misfit
         if len(self._state) >= MOST_NODES:
+            self.known = found = self._wandered(found)
             self.before = found.with_covariance(found.covariance * FORGOTTEN, self.prior)
             self._begin()
         return True
+
+    def _wandered(self, known: Knowledge) -> Knowledge:
+        """With the bias of the newest node, which is known less well by its walk over the stretch."""
+        if self._state is None or self._noise.bias_walk_radps == 0.0:
+            return known
+        mean, covariance = known.mean.copy(), known.covariance.copy()
+        mean[GYRO_BIAS] += self._state[-1, BIAS]
+        covariance[GYRO_BIAS, GYRO_BIAS] += self._noise.bias_walk_radps**2 * self._now_s
+        return dataclasses.replace(known, mean=mean, covariance=covariance)
 
     def _nodes(self) -> Nodes:
         """The stretch with the nodes of the last step, and dead-reckoned new ones."""
@@ -166,7 +176,9 @@ class SelfCalibration:
         known = len(self._state)
         state = np.vstack([self._state, np.zeros((len(self._first) - known, NODE))])
         base, last = self._first[known - 1], self._state[-1]
-        path, new = dead_reckoned(drive, self.known.mean, base), drive.first[known:] - base
+        numbers = self.known.mean.copy()
+        numbers[GYRO_BIAS] += last[BIAS]
+        path, new = dead_reckoned(drive, numbers, base), drive.first[known:] - base
         yaw = last[2]
         at = complex(last[0], last[1]) + (1.0 + last[3]) * np.exp(1j * yaw) * path.z[new]
         state[known:, 0], state[known:, 1], state[known:, 2] = at.real, at.imag, yaw + path.yaw_rad[new]

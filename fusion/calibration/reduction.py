@@ -18,6 +18,7 @@ from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
     GNSS_DELAY,
+    GYRO_BIAS,
     NUMBERS,
     WHEEL_SCALE,
     feigned_by_slip,
@@ -26,12 +27,12 @@ from terrafusion.fusion.calibration.slip import SlipMoments
 
 Places = NDArray[np.intp]
 
-X, Y, YAW, RATIO, DRIFT_E, DRIFT_N = range(6)
-NODE, SHARED = 6, len(NUMBERS)
+X, Y, YAW, RATIO, DRIFT_E, DRIFT_N, BIAS = range(7)
+NODE, SHARED = 7, len(NUMBERS)
 LINK_SHARE, LINK_M = 0.01, 0.02
 """Error of a link's position: a share of its distance, and a constant."""
-YAW_PER_S_RAD = 2e-4
-"""Error of a link's turn by a wandering bias, rad per second."""
+FIRST_BIAS_RADPS, LEAST_BIAS_WALK = 1e-6, 1e-7
+"""1 sigma of the first node's bias about the number, and of its walk without a gyro, rad/s/sqrt(s): none."""
 CAUCHY_SQUARE = 6.0
 """Squared normalised residual of a fix (two axes) at which it counts half: 95 % of good ones are below."""
 MOST_SHARED = 0.95
@@ -49,6 +50,7 @@ class Noise:
     Attributes:
         yaw_density_radps: white noise of the turn's source, rad/s/sqrt(Hz); turn_share: of a turn.
         drift_share: drifting share of a fix's variance; drift_time_s: its correlation time.
+        bias_walk_radps: random walk of the gyro's bias, rad/s/sqrt(s); 0 without a gyro.
         skids: whether wheels or tracks skid in every turn.
     """
 
@@ -56,12 +58,13 @@ class Noise:
     turn_share: float
     drift_share: float
     drift_time_s: float
+    bias_walk_radps: float = 0.0
     skids: bool = False
 
 
 @dataclass(eq=False)
 class Nodes:
-    """A drive and the estimates of its nodes: (M, 6) as `X` ... `DRIFT_N`."""
+    """A drive and the estimates of its nodes: (M, 7) as `X` ... `BIAS`, the last about the number."""
 
     drive: MotionSegment
     state: Array
@@ -75,11 +78,11 @@ class Reduction:
         part: the drive; its nodes move with `apply`.
         numbers, spread, noise: about which all is linearised.
         fixes, interval, node: the fixes inside the drive, the sample before each, its node.
-        rows, left: of the fixes, (F, 2, 15) and (F, 2), whitened without the robust weight.
-        diagonal, below, border, own: normal equations of the nodes: blocks (M, 6, 6) of each and of it with
-            the one after; (M, 6, 9) with the numbers; right-hand side (M, 6).
+        rows, left: of the fixes, (F, 2, 16) and (F, 2), whitened without the robust weight.
+        diagonal, below, border, own: normal equations of the nodes: blocks (M, 7, 7) of each and of it with
+            the one after; (M, 7, 9) with the numbers; right-hand side (M, 7).
         information, right: of the numbers, (9, 9) and (9,); without the nodes once all is done.
-        factor: Cholesky factor (12, 6 M) of the nodes' band.
+        factor: Cholesky factor (14, 7 M) of the nodes' band.
         done_nodes, done_fixes: how many are assembled.
         misfit: variance of the fixes' residuals, by their median, over that of their white noise; at least 1.
     """
@@ -193,7 +196,7 @@ class Reduction:
         self.done_fixes += len(rows)
 
     def _add(self, rows: Array, left: Array, node: Places, nodes: int) -> None:
-        """Add whitened rows (m, r, 6 nodes + 9), residuals (m, r), over 1 or 2 nodes from `node` (m,) on."""
+        """Add whitened rows (m, r, 7 nodes + 9), residuals (m, r), over 1 or 2 nodes from `node` (m,) on."""
         if not len(rows):
             return
         across = rows.transpose(0, 2, 1)
@@ -231,17 +234,17 @@ class Reduction:
         return np.asarray(linalg.cho_solve_banded((self.factor, True), right, check_finite=False))
 
     def _fix_rows(self, path: Path, begin: int, chosen: slice) -> tuple[Array, Array]:
-        """Rows (m, 2, 15) and residuals (m, 2) of fixes, by a path from sample `begin` on."""
+        """Rows (m, 2, 16) and residuals (m, 2) of fixes, by a path from sample `begin` on."""
         drive, numbers, node, j = self.part.drive, self.numbers, self.node[chosen], self.interval[chosen]
         at_s = drive.fix_t_s[self.fixes[chosen]] - numbers[GNSS_DELAY]
         dt = drive.t_s[j + 1] - drive.t_s[j]
         share = (at_s - drive.t_s[j]) / dt
         j, start = j - begin, drive.first[node] - begin
         between = lambda x: x[j] + share.reshape(-1, *[1] * (x.ndim - 1)) * (x[j + 1] - x[j])  # noqa: E731
-        leg = _legs(path, start, between)
+        own = self.part.state[node]
+        leg = _legs(path, start, between, own[:, BIAS])
         rate = (path.yaw_rad[j + 1] - path.yaw_rad[j]) / dt
         velocity = (path.z[j + 1] - path.z[j]) / dt * np.exp(-1j * path.yaw_rad[start])
-        own = self.part.state[node]
         heading, ratio = np.exp(1j * own[:, YAW]), 1.0 + own[:, RATIO]
         antenna = drive.antenna_m + complex(numbers[ANTENNA_X], numbers[ANTENNA_Y])
         turned = np.exp(1j * leg.yaw)
@@ -254,6 +257,7 @@ class Reduction:
         by[:, YAW], by[:, RATIO] = 1j * heading * arm, heading * leg.z
         shared = by[:, NODE:]
         shared[:] = heading[:, None] * (ratio[:, None] * leg.z_by + 1j * lever[:, None] * leg.yaw_by)
+        by[:, BIAS] = shared[:, GYRO_BIAS]
         shared[:, ANTENNA_X] = heading * turned
         shared[:, ANTENNA_Y] = 1j * shared[:, ANTENNA_X]
         shared[:, GNSS_DELAY] = -heading * (ratio * velocity + 1j * lever * rate)
@@ -269,7 +273,7 @@ class Reduction:
         here = np.arange(begin, min(end, len(first) - 1))
         now, then = self.part.state[here], self.part.state[here + 1]
         after = first[here + 1] - first[begin]
-        leg = _legs(path, first[here] - first[begin], lambda x: x[after])
+        leg = _legs(path, first[here] - first[begin], lambda x: x[after], now[:, BIAS])
         heading, ratio = np.exp(1j * now[:, YAW]), 1.0 + now[:, RATIO]
         dt = drive.t_s[first[here + 1]] - drive.t_s[first[here]]
         moved = heading * ratio * leg.z
@@ -278,20 +282,25 @@ class Reduction:
         by[:, X], by[:, Y], by[:, NODE + X], by[:, NODE + Y] = -1.0, -1j, 1.0, 1j
         by[:, YAW], by[:, RATIO] = -1j * moved, -heading * leg.z
         by[:, 2 * NODE :] = -(heading * ratio)[:, None] * leg.z_by
+        by[:, BIAS] = by[:, 2 * NODE + GYRO_BIAS]
         position = 1.0 / (LINK_SHARE * np.abs(leg.z) + LINK_M)
         turned = then[:, YAW] - now[:, YAW] - leg.yaw
         by_yaw = np.zeros((len(here), 2 * NODE + SHARED))
         by_yaw[:, YAW], by_yaw[:, NODE + YAW], by_yaw[:, 2 * NODE :] = -1.0, 1.0, -leg.yaw_by
-        angle = 1.0 / np.sqrt(
-            noise.yaw_density_radps**2 * dt + (noise.turn_share * leg.yaw) ** 2 + (YAW_PER_S_RAD * dt) ** 2
-        )
+        by_yaw[:, BIAS] = -leg.yaw_by[:, GYRO_BIAS]
+        angle = 1.0 / np.sqrt(noise.yaw_density_radps**2 * dt + (noise.turn_share * leg.yaw) ** 2)
+        wandered = 1.0 / (np.hypot(noise.bias_walk_radps, LEAST_BIAS_WALK) * np.sqrt(dt))
+        by_bias = np.zeros((len(here), 1, 2 * NODE + SHARED))
+        by_bias[:, 0, BIAS], by_bias[:, 0, NODE + BIAS] = -wandered, wandered
+        walked = ((then[:, BIAS] - now[:, BIAS]) * wandered)[:, None]
         decay = np.exp(-dt / noise.drift_time_s)
         sigma_m = float(np.median(drive.fix_sigma_m)) * np.sqrt(noise.drift_share) + 1e-4
         wander = 1.0 / (sigma_m * np.sqrt(1.0 - decay**2))
         by_drift = np.zeros((len(here), 2, 2 * NODE + SHARED))
         for row, place in enumerate((DRIFT_E, DRIFT_N)):
             by_drift[:, row, place], by_drift[:, row, NODE + place] = -decay * wander, wander
-        drifted = (then[:, DRIFT_E:] - decay[:, None] * now[:, DRIFT_E:]) * wander[:, None]
+        drift = slice(DRIFT_E, DRIFT_N + 1)
+        drifted = (then[:, drift] - decay[:, None] * now[:, drift]) * wander[:, None]
         rows = np.stack(
             [by.real * position[:, None], by.imag * position[:, None], by_yaw * angle[:, None]], axis=1
         )
@@ -301,13 +310,19 @@ class Reduction:
         alone[:, 0, RATIO], alone[:, 0, NODE + WHEEL_SCALE] = 1.0 / self.spread, -1.0 / self.spread
         about = (self.part.state[every][:, [RATIO]] - self.numbers[WHEEL_SCALE]) / self.spread
         out = [
-            (np.concatenate([rows, by_drift], axis=1), np.concatenate([left, drifted], axis=1), here, 2),
+            (
+                np.concatenate([rows, by_drift, by_bias], axis=1),
+                np.concatenate([left, drifted, walked], axis=1),
+                here,
+                2,
+            ),
             (alone, about, every, 1),
         ]
         if begin == 0:
-            start = np.zeros((1, 2, NODE + SHARED))
-            start[0, 0, DRIFT_E] = start[0, 1, DRIFT_N] = 1.0 / sigma_m
-            out.append((start, self.part.state[:1, DRIFT_E:] / sigma_m, every[:1], 1))
+            start = np.zeros((1, 3, NODE + SHARED))
+            about = np.array([sigma_m, sigma_m, FIRST_BIAS_RADPS])
+            start[0, [0, 1, 2], [DRIFT_E, DRIFT_N, BIAS]] = 1.0 / about
+            out.append((start, self.part.state[:1, DRIFT_E:] / about, every[:1], 1))
         return out
 
 
@@ -341,10 +356,15 @@ class _Legs:
     yaw_by: Array
 
 
-def _legs(path: Path, start: Places, at: Callable[[Any], Any]) -> _Legs:
-    """Legs from the samples `start` of a path to where `at` takes the values of a series."""
+def _legs(path: Path, start: Places, at: Callable[[Any], Any], bias_radps: Array) -> _Legs:
+    """Legs from the samples `start` of a path to where `at` takes the values of a series.
+
+    `bias_radps` is each leg's bias about the number with which the path was dead-reckoned.
+    """
     back = np.exp(-1j * path.yaw_rad[start])
     along = (at(path.z) - path.z[start]) * back
     own_by = path.yaw_by[start]
     by = (at(path.z_by) - path.z_by[start]) * back[:, None] - 1j * own_by * along[:, None]
-    return _Legs(along, at(path.yaw_rad) - path.yaw_rad[start], by, at(path.yaw_by) - own_by)
+    turned, yaw_by = at(path.yaw_rad) - path.yaw_rad[start], at(path.yaw_by) - own_by
+    along = along + by[:, GYRO_BIAS] * bias_radps
+    return _Legs(along, turned + yaw_by[:, GYRO_BIAS] * bias_radps, by, yaw_by)

@@ -53,6 +53,8 @@ LEAST_SLIP_SIGMA = 0.02
 """Least sigma of learned slip: the next ground may be another one (assumed)."""
 GYRO_DENSITY_RADPS, WHEEL_TURN_SHARE = 3e-3, 0.1
 """Noise of the turn over seconds, beyond what a bias explains (assumed)."""
+BIAS_WALK_RADPS = 1e-4
+"""Random walk of the gyro's bias, rad/s/sqrt(s), as it warms up after power-on (assumed)."""
 TURN_TIME_S = 10.0
 """Duration of a turn in one direction, over which a wrong scale adds up without fixes (assumed)."""
 NEGLIGIBLE = 0.1
@@ -359,6 +361,7 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
         WHEEL_TURN_SHARE if wheels else 0.0,
         1.0 - WHITE_SHARE,
         max(sensors.gnss.correlation_time_s, 1.0),
+        BIAS_WALK_RADPS if inputs.yaw == "gyro" else 0.0,
         config.rig.drive in SKIDDING,
     )
     antenna_m = complex(*sensors.gnss.antenna_m[:2]) + config.rig.ahead_m

@@ -11,7 +11,15 @@ import pytest
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import online
 from terrafusion.fusion.calibration.motion import MotionSegment
-from terrafusion.fusion.calibration.numbers import COURSE_LAG, GNSS_DELAY, NUMBERS, SLIP_PER_GRADE, Knowledge
+from terrafusion.fusion.calibration.numbers import (
+    COURSE_LAG,
+    GNSS_DELAY,
+    GYRO_BIAS,
+    NUMBERS,
+    SLIP_PER_GRADE,
+    TURN_SCALE,
+    Knowledge,
+)
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.twin.simulate import simulate
@@ -84,6 +92,19 @@ def test_a_long_drive_is_cut_into_stretches_and_keeps_what_it_learned() -> None:
     known = driven(figure(600.0, fix_sigma_m=0.05), learning)
     assert len(learning._first) < MOST_NODES + 2
     assert np.allclose(known[-1].mean[:6], TRUE[:6], atol=[3e-3, 3e-4, 6e-3, 0.03, 0.03, 0.03])
+
+
+def test_a_gyro_that_warms_up_is_not_taken_for_one_with_another_scale() -> None:
+    """Its bias grows by .01 rad/s in ten minutes; were it constant in a stretch, the scale would be .5 % off."""
+    drive = figure(700.0, fix_sigma_m=0.5, slip=0.02)
+    warm = 0.012 * (1.0 - np.exp(-drive.t_s / 400.0))
+    turn = drive.turn_rad + 0.5 * (warm[1:] + warm[:-1]) * np.diff(drive.t_s)
+    learning = SelfCalibration(PRIOR, dataclasses.replace(NOISE, bias_walk_radps=1e-4), 0j)
+    driven(dataclasses.replace(drive, turn_rad=turn), learning)
+    learning.restart()
+    error = np.abs(learning.known.mean - TRUE - warm[-1] * (np.arange(len(TRUE)) == GYRO_BIAS))
+    assert error[TURN_SCALE] < 2.0 * learning.known.sigma[TURN_SCALE] < 0.004
+    assert error[GYRO_BIAS] < 3.0 * learning.known.sigma[GYRO_BIAS] < 0.005
 
 
 def test_missing_samples_end_a_stretch_but_not_what_was_learned() -> None:
