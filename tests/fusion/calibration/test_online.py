@@ -95,7 +95,7 @@ def test_a_long_drive_is_cut_into_stretches_and_keeps_what_it_learned() -> None:
 
 
 def test_a_gyro_that_warms_up_is_not_taken_for_one_with_another_scale() -> None:
-    """Its bias grows by .01 rad/s in ten minutes; were it constant in a stretch, the scale would be .5 % off."""
+    """Its bias grows by .01 rad/s in ten minutes; if it were constant, the scale would be .5 % off."""
     drive = figure(700.0, fix_sigma_m=0.5, slip=0.02)
     warm = 0.012 * (1.0 - np.exp(-drive.t_s / 400.0))
     turn = drive.turn_rad + 0.5 * (warm[1:] + warm[:-1]) * np.diff(drive.t_s)
