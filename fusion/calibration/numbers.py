@@ -27,7 +27,8 @@ NUMBERS = (
 """In the order of every vector of numbers:
 
 - turn_scale: true turn over that of its source (gyro z, or the wheels over the track), less one.
-- gyro_bias: mean reading of the source of yaw without any turn.
+- gyro_bias: mean reading of the source of yaw without any turn; while a drive is learned from, that at its
+  first node, about which it wanders.
 - wheel_scale: true distance over that of the wheels, less one; slip of the usual ground included.
 - antenna: correction of the lever arm, body x and y.
 - gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw. Wheels that slip while

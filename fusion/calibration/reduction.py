@@ -320,9 +320,9 @@ class Reduction:
         ]
         if begin == 0:
             start = np.zeros((1, 3, NODE + SHARED))
-            about = np.array([sigma_m, sigma_m, FIRST_BIAS_RADPS])
-            start[0, [0, 1, 2], [DRIFT_E, DRIFT_N, BIAS]] = 1.0 / about
-            out.append((start, self.part.state[:1, DRIFT_E:] / about, every[:1], 1))
+            sigma = np.array([sigma_m, sigma_m, FIRST_BIAS_RADPS])
+            start[0, [0, 1, 2], [DRIFT_E, DRIFT_N, BIAS]] = 1.0 / sigma
+            out.append((start, self.part.state[:1, DRIFT_E:] / sigma, every[:1], 1))
         return out
 
 
