@@ -29,6 +29,8 @@ from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
+PREFACE_LINES = 60
+"""So many lines may stand in front of a header."""
 """Rows that tell a decimal comma."""
 _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 """What may stand in front of a header for Excel."""
@@ -44,8 +46,9 @@ class TextColumns:
 
     def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
-        text = read_text(path)
+        text = read_text(path, any_encoding=True)
         self._layout = _layout(text, column_map)
+        self._preface = max(_below_preface(text) - 1, 0)
         text, self._repeated = _headed_once(text, self._layout)
         self.units = _units_below(text, self._layout)
         if self.units:
@@ -62,6 +65,7 @@ class TextColumns:
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
         self.notes += [again] if self._repeated else []
+        self.notes += [f"{self._preface} lines in front of the header are left out"] if self._preface else []
         self.notes += ["the line below the header holds units; left out"] if self.units else []
 
     def first_cells(self) -> list[str]:
@@ -101,7 +105,10 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     """Names from the first line that is no comment, or from the comment before a first line of numbers;
     without a map, a first line of numbers is a row."""
     comment, header, number = "", "", 0
+    begin = _below_preface(data)
     for at, line in head_lines(data):
+        if at < begin:
+            continue
         if line.startswith(COMMENT):
             comment = line.lstrip("# ")
         elif line.strip() and not _EXCEL.fullmatch(line):
@@ -121,6 +128,32 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
         cells, first_line = numbered(len(cells)), number
     limits.check_columns(len(cells))
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
+
+
+def _below_preface(data: bytes) -> int:
+    """The line of names, from 1, where lines of other lengths stand in front of it; else 0.
+
+    It is the first of those that are as long as the first two rows of numbers, right above them.
+    """
+    lines = [
+        (at, line) for at, line in head_lines(data, PREFACE_LINES) if line.strip() and line[0] != COMMENT
+    ]
+    for mark in "\t;,":
+        cells = [split(line, mark) for _, line in lines]
+        rows = (
+            k
+            for k in range(1, len(cells))
+            if len(cells[k]) > 2
+            and sum(map(_is_number, cells[k - 1])) > 1
+            and sum(map(_is_number, cells[k])) > 1
+            and len(cells[k]) == len(cells[k - 1])
+        )
+        row = top = next(rows, 1) - 1
+        while top and len(cells[top - 1]) == len(cells[row]):
+            top -= 1
+        if 0 < top < row:
+            return lines[top][0]
+    return 0
 
 
 def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
@@ -166,6 +199,10 @@ def _headed_once(data: bytes, layout: TextLayout) -> tuple[bytes, int]:
         return data, 0
     rows, count = re.subn(rb"(?<=\n)" + re.escape(header) + rb"\r?(?=\n)", b"", data[end - 1 :])
     return (type(data)(data[: end - 1] + rows), count) if count else (data, 0)
+
+
+def _is_number(cell: str) -> bool:
+    return number_in(cell.replace(",", ".")) is not None
 
 
 def _is_value(cell: str) -> bool:
