@@ -101,6 +101,10 @@ def _few(names: list[str]) -> str:
 
 def _mapless(path: Path, columns: TableColumns) -> DataError:
     names, first = columns.names, columns.first_cells()
+    signal = next((name for name in names if name.lower() in ("signal", "variable", "name", "topic")), "")
+    if signal and "value" in map(str.lower, names):
+        what = f"is a long table: a value of one '{signal}' a line"
+        return DataError(what, remedy=f"export one column for each '{signal}', and one of time")
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
     proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)

@@ -149,6 +149,12 @@ def test_columns_of_euroc_are_proposed(tmp_path: Path) -> None:
     assert recording.truth.quaternion.tolist() == [[0, 0, 1, 0]]
 
 
+def test_a_long_table_is_named(tmp_path: Path) -> None:
+    path = table(tmp_path, "time,id,Signal,Value\n0,0x181,WheelSpeedLeft,1.5\n0,0x201,YawRate,0.2\n", None)
+    with pytest.raises(DataError, match=r"a long table: .*export one column for each 'Signal'"):
+        open_recording(path)
+
+
 def test_whole_numbers_of_encoders_are_proposed_as_ticks() -> None:
     names = ["t", "enc_left", "enc_right"]
     assert "unit: rev, scale: 1/1024" in starter_map(names, ["0", "-12", "7"])
