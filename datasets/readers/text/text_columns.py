@@ -14,6 +14,7 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
+    BLANKS,
     BOM,
     MISSING,
     TextLayout,
@@ -50,9 +51,8 @@ class TextColumns:
         self._layout = _layout(text, column_map)
         self._preface = max(_below_preface(text) - 1, 0)
         text, self._repeated = _headed_once(text, self._layout)
-        self.units = _units_below(text, self._layout)
-        if self.units:
-            self._layout = dataclasses.replace(self._layout, first_line=self._layout.first_line + 1)
+        self.units, row = _units_below(text, self._layout)
+        self._layout = dataclasses.replace(self._layout, first_line=row)
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -138,22 +138,16 @@ def _below_preface(data: bytes) -> int:
     lines = [
         (at, line) for at, line in head_lines(data, PREFACE_LINES) if line.strip() and line[0] != COMMENT
     ]
-    for mark in "\t;,":
-        cells = [split(line, mark) for _, line in lines]
-        rows = (
-            k
-            for k in range(1, len(cells))
-            if len(cells[k]) > 2
-            and sum(map(_is_number, cells[k - 1])) > 1
-            and sum(map(_is_number, cells[k])) > 1
-            and len(cells[k]) == len(cells[k - 1])
-        )
-        row = top = next(rows, 1) - 1
-        while top and len(cells[top - 1]) == len(cells[row]):
-            top -= 1
-        if 0 < top < row:
-            return lines[top][0]
-    return 0
+    marks = [separator_of(line) for _, line in lines]
+    cells = [
+        split(line, mark) if mark != BLANKS else [] for (_, line), mark in zip(lines, marks, strict=True)
+    ]
+    numbers = [len(row) if sum(map(_is_number, row)) > 1 else 0 for row in cells]
+    rows = (k for k in range(len(cells) - 1) if numbers[k] == numbers[k + 1] > 2)
+    first = top = next(rows, 0)
+    while top and len(cells[top - 1]) == len(cells[first]):
+        top -= 1
+    return lines[top][0] if 0 < top < first else 0
 
 
 def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
@@ -174,13 +168,18 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
 
 
-def _units_below(data: bytes, layout: TextLayout) -> list[str]:
-    """The cells of a line of units below the header, without brackets; [] where that line is a row."""
-    at, line = next(((at, line) for at, line in head_lines(data) if at >= layout.first_line), (0, ""))
+def _units_below(data: bytes, layout: TextLayout) -> tuple[list[str], int]:
+    """The cells of a line of units below the header, without brackets, and the line after it.
+
+    [] and the first line where that one is a row.
+    """
+    below = ((at, line) for at, line in head_lines(data) if at >= layout.first_line and line.strip())
+    at, line = next(below, (0, ""))
     cells = [cell.strip("[]() ") for cell in split(line, layout.separator)] if at > 1 else []
     rows = any(number_in(cell) is not None or re.search(r"\d\d", cell) for cell in cells)
     known = any(cell.replace(" ", "").lower() in UNIT_OF for cell in cells)
-    return cells if known and not rows and len(cells) == len(layout.names) else []
+    found = known and not rows and len(cells) == len(layout.names)
+    return (cells, at + 1) if found else ([], layout.first_line)
 
 
 def _begin(data: bytes, line: int) -> int:

@@ -120,7 +120,7 @@ def test_a_packed_table_is_read(tmp_path: Path) -> None:
     assert len(open_recording(path).channels()["imu"]) == 2
 
 
-@pytest.mark.parametrize("units", ["", "s,deg/s,km/h\n\n"])
+@pytest.mark.parametrize("units", ["", "s,deg/s,km/h\n\n", "t,gz,speed\ns,deg/s,km/h\n"])
 @pytest.mark.parametrize(
     "preface", ["Logger v1.2, unit 7\n\n", '"Format","CSV File",,"Robot"\n"Duration","150","s","",\n']
 )
