@@ -29,7 +29,7 @@ TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN, TWIST),
     "gnss": (FIX, GPS_FIX, GPS_FIX_1),
-    "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
+    "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED, GPS_FIX, GPS_FIX_1),
     "command": (TWIST_STAMPED, TWIST),
     "truth": (ODOMETRY, POSE_COVARIANCE, POSE),
     "terrain": (STRING,),
@@ -141,6 +141,8 @@ def choose_topics(
     for kind in TYPES:
         taken = {t.name for k, t in chosen.items() if k != kind and {k, kind} != {"wheels", "steering"}}
         found = [t for t in bag if t.msgtype in TYPES[kind] and t.name not in taken]
+        if kind == "gnss_velocity" and not ("gnss" in chosen and chosen["gnss"].msgtype == FIX):
+            found = [t for t in found if t.msgtype not in TYPES["gnss"]]  # fixes have that of their own
         fits = [
             t for t in found if _fits(kind, t, is_steering_joints if kind == "steering" else is_wheel_joints)
         ]
@@ -263,6 +265,8 @@ def looks_fused(kind: str, topic: BagTopic) -> bool:
 
 def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool:
     name = topic.name
+    if kind == "gnss_velocity" and topic.msgtype in TYPES["gnss"]:
+        return not looks_fused("gnss", topic)
     if kind in _NAMED:
         return bool(_NAMED[kind].search(name))
     if kind in ("imu", "barometer", "magnetometer"):
