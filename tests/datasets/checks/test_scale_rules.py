@@ -353,11 +353,14 @@ def test_the_path_tells_by_how_much_the_gyro_is_wrong(factor: float) -> None:
     assert repaired.gyro_radps[:, 2] == pytest.approx(rate, rel=2e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize(("windows", "used"), [(7, None), (8, "the path of the truth")])
-def test_a_path_of_few_stretches_tells_none(
-    drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, used: str | None
+@pytest.mark.parametrize(
+    ("windows", "low", "used"),
+    [(7, 0.04, None), (8, 0.04, "the path of the truth"), (7, 0.0501, "the path of the truth")],
+)
+def test_a_path_of_few_stretches_tells_clear_errors_only(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, low: float, used: str | None
 ) -> None:
-    error = BootstrapInterval(0.05, 0.04, 0.06)
+    error = BootstrapInterval(0.06, low, 0.07)
     model = SimpleNamespace(windows=windows, gyro_scale=error)
     monkeypatch.setattr(scale, "model_by_fixes", lambda _: None)
     monkeypatch.setattr(scale, "model_by_truth", lambda _: model)
