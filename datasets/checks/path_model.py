@@ -41,7 +41,7 @@ delay fits clearly better than none."""
 
 @dataclass(frozen=True)
 class PathModel:
-    """Scale error of the gyro (0: right), and seconds by which the positions are late.
+    """Scale error of the gyro (0.1: it reads 1.1 times the turns), and seconds by which positions are late.
 
     `rest` is what a delay leaves of the residuals, over what none leaves.
     """
@@ -156,6 +156,8 @@ def _fitted(windows: _Windows, start_s: float, usual_s: float, rest: float) -> P
     draws = resampled_rows(len(H))
     right = h[draws].sum(axis=1) - prior @ (unknown - usual)
     drawn = unknown + np.linalg.solve(H[draws].sum(axis=1) + prior, right[..., None])[..., 0]
+    # The unknown multiplies what the gyro reads; its error is what it reads over the turns, less one.
+    unknown[0], drawn[:, 0] = 1.0 / (1.0 + unknown[0]) - 1.0, 1.0 / (1.0 + drawn[:, 0]) - 1.0
     scale, delay = (
         interval_of(float(unknown[k]), drawn[:, k], len(H))
         if _contributing(H[:, k, k]) >= LEAST_CONTRIBUTING

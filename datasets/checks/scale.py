@@ -35,7 +35,8 @@ STEEPEST = 0.05
 """Mean descent above which a robot may roll faster than its braked wheels."""
 YAW_WINDOW_S, LEAST_YAW_WINDOWS, LEAST_YAW_R = 4.0, 12, 0.95
 """Yaw rates are compared as means over windows so long that a delay hardly matters."""
-PATH_WINDOWS = 8
+PATH_WINDOWS, CLEAR_GYRO = 8, 0.05
+"""Fewer windows of a path count where the whole interval lies beyond the second."""
 LARGE_GYRO, SURE_GYRO, WIDEST_GYRO = 0.02, 0.01, 0.05
 """A scale error counts from the first on, with its interval beyond the second and narrower than the third."""
 MOST_GYRO_MISSING = 0.01
@@ -214,7 +215,7 @@ def _by_path(context: CheckContext) -> tuple[BootstrapInterval, str] | None:
     paths = (model_by_fixes, "the path of the fixes"), (model_by_truth, "the path of the truth")
     for model_by, name in paths:
         model = model_by(context)
-        if model is not None and model.windows >= PATH_WINDOWS:
+        if model is not None and (model.windows >= PATH_WINDOWS or model.gyro_scale.is_beyond(CLEAR_GYRO)):
             return model.gyro_scale, name
     return None
 

@@ -2,7 +2,8 @@
 
 A clock that is set while it records makes time run back, or jump ahead. A step is removed by shifting
 all later times so that the interval at the step is the nominal one; the repaired clock is off by less
-than a sampling period. Messages that arrived out of order have correct times; `in_order` sorts them.
+than a sampling period, and exact where a counter wrapped. Messages that arrived out of order have correct
+times; `in_order` sorts them.
 """
 
 import dataclasses
@@ -32,6 +33,8 @@ SHARED_ROWS = 3
 """Rows around a step of one channel in which another channel of that clock shows it."""
 LEAP_PERIODS, LEAP_S = 10, 0.5
 """An interval longer than both is a jump ahead, where those are removed."""
+TURNS_NS = (2**32 * 10**6, 2**32 * 10**3, 604_800 * 10**9, 3600 * 10**9)
+"""After so long a clock starts again: counters of ms and us, GPS weeks, hours where summer time ends."""
 MAX_STEPS = 1000
 
 
@@ -148,7 +151,9 @@ def _steps(t_ns: TimesNs, channel: str, beside: TimesNs | None) -> list[Step]:
         first = steps[-1][0] if steps else 0  # rows before an earlier step have another offset
         if interval[row - 1] < 0 and _is_disorder(t_ns[first:], row - first, period):
             continue
-        steps.append((row, round(period) - int(interval[row - 1])))
+        back_ns = -int(interval[row - 1])
+        turn = next((turn for turn in TURNS_NS if 0 <= turn - back_ns < LEAP_S * 1e9), None)
+        steps.append((row, round(period) + back_ns if turn is None else turn))
         if len(steps) > MAX_STEPS:
             raise DataError(
                 f"time jumps more than {MAX_STEPS} times: no clock that could be repaired",

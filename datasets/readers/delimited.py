@@ -28,6 +28,8 @@ from terrafusion.datasets.core.quantity import shown
 
 BLOCK = 1 << 20
 BOM = b"\xef\xbb\xbf"
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+"""Byte order marks of the "Unicode text" that Excel writes."""
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
 
@@ -134,14 +136,15 @@ class CutText(bytes):
     """Text of a file that is cut off inside its last line."""
 
 
-def read_text(path: Path) -> bytes:
-    """The bytes of a text file, unpacked where it is a .gz, without a byte order mark.
+def read_text(path: Path, *, any_encoding: bool = False) -> bytes:
+    """The bytes of a text file in UTF-8, unpacked where it is a .gz, without a byte order mark.
 
     Of a .gz that ends too early, and of a file with zeros for its end (as after a loss of power), it is the
     `CutText` that is there.
 
     Raises:
-        DataError: unreadable, empty, over 512 MB, or no UTF-8 text.
+        DataError: unreadable, empty, over 512 MB, or no text in UTF-8 (in `any_encoding`, UTF-16 and that of
+            Windows, too).
     """
     cut = False
     try:
@@ -160,6 +163,8 @@ def read_text(path: Path) -> bytes:
         what = f"cannot be read: {getattr(error, 'strerror', '') or error}"
         raise DataError(what, remedy="is it complete?") from None
     data = bytes(read).removeprefix(BOM)
+    if any_encoding and data.startswith(UTF_16):
+        data = data.decode("utf-16", "replace").encode()
     _check_size(data, packed)
     if data.endswith(b"\0"):
         cut, data = True, data.rstrip(b"\0")
@@ -168,7 +173,9 @@ def read_text(path: Path) -> bytes:
     try:
         data.isascii() or data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise DataError(f"not UTF-8 at byte {error.start}", remedy="save it as UTF-8") from None
+        if not any_encoding:
+            raise DataError(f"not UTF-8 at byte {error.start}", remedy="save it as UTF-8") from None
+        data = data.decode("cp1252", "replace").encode()
     if b"\0" in data:
         raise DataError("holds zero bytes: not a text file", remedy="copy it again")
     return CutText(data) if cut else data

@@ -12,6 +12,7 @@ from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.readers.delimited import UTF_16
 
 HEAD_BYTES = 4096
 MAP_SUFFIX = ".columns.yaml"
@@ -116,6 +117,8 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         if path.is_file():
             with path.open("rb") as file:
                 head = file.read(HEAD_BYTES)
+            if head.startswith(UTF_16):
+                head = head.decode("utf-16", "replace").encode()
             if not head:
                 raise DataError("the file is empty", file=path, remedy="record or copy it again")
         mapped = mapped or bool(head and path.with_name(path.name + MAP_SUFFIX).is_file())
@@ -124,8 +127,6 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         found = table or next((form for form in FORMATS if form.claims(path, head)), None)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
-    if found is None and head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise DataError("is text in UTF-16", file=path, remedy="save it as UTF-8")
     if found is None:
         kinds = ", ".join(form.description for form in FORMATS)
         raise DataError(

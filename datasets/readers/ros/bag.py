@@ -137,10 +137,12 @@ def _recording(container: BagContainer, request: Request) -> Recording:
         streams.pop("gnss_velocity", None)
     if not set(streams) - {"datum", "gnss_velocity"}:
         seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics_of(container)) or "none"
-        raise DataError(
-            f"no topic of a type this library uses; topics here: {seen}",
-            remedy="name one with --topic, such as --topic imu=/imu/data",
-        )
+        others = {source.encoding[:20] for source in container.sources} - {"cdr", "ros1"}
+        what = f"no topic of a type this library uses; topics here: {seen}"
+        if others:
+            remedy = f"messages in {', '.join(sorted(others))} are not read: export them as tables (.csv)"
+            raise DataError(what, remedy=remedy)
+        raise DataError(what, remedy="name one with --topic, such as --topic imu=/imu/data")
     if "wheels" not in chosen:
         taken = [topic.name for kind, topic in chosen.items() if kind not in ("command", "steering")]
         notes.append(wheel_advice(topics_of(container), taken, functools.partial(_joints, container)))

@@ -362,8 +362,8 @@ class ChannelBuilder:
 
     def gnss_velocity(self, gnss: Gnss, stream: Stream, t_ns: TimesNs) -> Gnss:
         """The fixes with the ENU velocity of another topic, matched within half a fix interval."""
-        twist, variance = twists(stream)
-        if not len(t_ns):
+        measured, deviation = fix_velocities(stream)
+        if measured is None or not len(t_ns):
             return gnss
         after = np.clip(np.searchsorted(t_ns, gnss.t_ns), 0, len(t_ns) - 1)
         before = np.clip(after - 1, 0, None)
@@ -371,17 +371,14 @@ class ChannelBuilder:
         nearest = np.where(nearer, before, after)
         interval = np.median(np.diff(gnss.t_ns)) if len(gnss) > 1 else 1e9
         close = np.abs(t_ns[nearest] - gnss.t_ns) <= min(interval / 2, 5e7)
-        velocity = np.where(close[:, None], twist[nearest, :3], np.nan)
-        velocity[:, 2][variance[nearest, 2] >= UNKNOWN_VARIANCE] = np.nan
+        velocity = np.where(close[:, None], measured[nearest], np.nan)
         without = int(np.isnan(velocity[:, :2]).any(axis=1).sum())
-        with np.errstate(invalid="ignore"):
-            deviation = np.sqrt(np.where(variance[nearest, 0] > 0, variance[nearest, 0], np.nan))
-        self.notes.append(
-            f"gnss: velocity of {stream.topic} taken as east, north, up; {without} fixes without"
-        )
+        meant = "of speed and track" if stream.msgtype in topics.TYPES["gnss"] else "taken as east, north, up"
+        self.notes.append(f"gnss: velocity of {stream.topic} {meant}; {without} fixes without")
         if np.isnan(velocity).all():
             return gnss
-        sigma = None if np.isnan(deviation).all() else np.where(close, deviation, np.nan)
+        sigma = None if deviation is None else np.where(close, deviation[nearest], np.nan)
+        sigma = None if sigma is None or np.isnan(sigma).all() else sigma
         return dataclasses.replace(gnss, velocity_enu_mps=velocity, sigma_v_mps=sigma)
 
     def datum(self, stream: Stream) -> Datum:

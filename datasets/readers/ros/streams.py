@@ -203,8 +203,15 @@ def fix_sigmas(stream: Stream) -> Array:
 
 
 def fix_velocities(stream: Stream) -> tuple[Array | None, Array | None]:
-    """ENU velocities (N, 3) m/s of GPSFix and their sigmas (N,), NaN where the driver leaves the speed at
-    zero; None where all are, and of other fixes."""
+    """ENU velocities (N, 3) m/s of a receiver's twists or GPSFix, and their sigmas (N,).
+
+    NaN where the driver of a GPSFix leaves the speed at zero; None where all are, and of other fixes.
+    """
+    if stream.msgtype in TWIST_AT:
+        twist, variance = twists(stream)
+        twist[:, 2][variance[:, 2] >= UNKNOWN_VARIANCE] = np.nan
+        with np.errstate(invalid="ignore"):
+            return twist[:, :3], np.sqrt(np.where(variance[:, 0] > 0, variance[:, 0], np.nan))
     speed = stream.column("speed").astype(float) if stream.has("speed") else np.zeros(0)
     if not np.nan_to_num(speed).any():
         return None, None

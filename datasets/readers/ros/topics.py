@@ -3,7 +3,7 @@
 import difflib
 import functools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.errors import DataError
@@ -29,7 +29,7 @@ TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN, TWIST),
     "gnss": (FIX, GPS_FIX, GPS_FIX_1),
-    "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
+    "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED, GPS_FIX, GPS_FIX_1),
     "command": (TWIST_STAMPED, TWIST),
     "truth": (ODOMETRY, POSE_COVARIANCE, POSE),
     "terrain": (STRING,),
@@ -77,6 +77,8 @@ _NAMED = {"truth": _TRUTH, "datum": _DATUM, "terrain": _TERRAIN, "command": _COM
           "gnss_velocity": _GNSS_VELOCITY}  # fmt: skip
 """Channels whose topics are known by their names alone."""
 _RAW = re.compile(r"raw", re.IGNORECASE)
+_ROBOT = re.compile(r"([_-]?\d+|[_-][a-z])/$", re.IGNORECASE)
+"""What tells names of robots such as husky_1 and husky_2 apart."""
 _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
 
 MOST_SHOWN = 8
@@ -115,7 +117,7 @@ def choose_topics(
     The user's choice goes first and must be there; then the vehicle's usual topics where the bag has
     them; then by type, the preferred one first. Of several sensors of a type `one_of` decides; of other
     topics the name, then the most messages, then the alphabet. A topic that looks like a fused estimate is
-    never taken for a sensor by itself.
+    never taken for a sensor by itself. Other robots than that of the wheels are left out.
 
     Args:
         bag: topics with at least one message.
@@ -135,9 +137,12 @@ def choose_topics(
         fits = [t for t in bag if t.name == name and t.msgtype in TYPES[kind]]
         if kind not in chosen and fits:
             chosen[kind] = fits[0]
+    bag = _of_one_robot(bag, chosen, is_wheel_joints, one_of, notes)
     for kind in TYPES:
         taken = {t.name for k, t in chosen.items() if k != kind and {k, kind} != {"wheels", "steering"}}
         found = [t for t in bag if t.msgtype in TYPES[kind] and t.name not in taken]
+        if kind == "gnss_velocity" and not ("gnss" in chosen and chosen["gnss"].msgtype == FIX):
+            found = [t for t in found if t.msgtype not in TYPES["gnss"]]  # fixes have that of their own
         fits = [
             t for t in found if _fits(kind, t, is_steering_joints if kind == "steering" else is_wheel_joints)
         ]
@@ -147,6 +152,49 @@ def choose_topics(
             chosen[kind] = one_of(kind, candidates) if kind in SENSORS and len(candidates) > 1 else fits[0]
         notes += _choice_notes(kind, chosen.get(kind), fits, found)
     return chosen, notes
+
+
+def _of_one_robot(
+    bag: list[BagTopic],
+    chosen: dict[str, BagTopic],
+    has_joints: Callable[[str], bool],
+    one_of: Callable[[str, list[BagTopic]], BagTopic],
+    notes: list[str],
+) -> list[BagTopic]:
+    """The bag without topics of other robots than that of the wheels; chooses the wheels where they are open.
+
+    A namespace with wheels and another sensor is a robot's, and so are those named alike but for a number or
+    a letter (husky_1, husky_2) that hold both together.
+    """
+    sensors = [(t, kind) for t in bag for kind in SENSORS if t.msgtype in TYPES[kind]]
+    paths = [t.name.split("/") for t, _ in sensors]
+    depth = next((i for i, parts in enumerate(zip(*paths, strict=False)) if len(set(parts)) > 1), 0)
+    spaces: dict[str, dict[str, list[BagTopic]]] = {}
+    for (topic, kind), path in zip(sensors, paths, strict=True):
+        if len(path) > depth + 1 and _fits(kind, topic, has_joints):
+            space = "/".join(path[: depth + 1]) + "/"
+            spaces.setdefault(space, {}).setdefault(kind, []).append(topic)
+    robots = [space for space, kinds in spaces.items() if _makes_a_robot(kinds)]
+    for space in spaces:
+        alike = [other for other in spaces if _ROBOT.sub("", other) == _ROBOT.sub("", space)]
+        if len(robots) < 2 <= len(alike) and _makes_a_robot(kind for one in alike for kind in spaces[one]):
+            robots = alike
+    if len(robots) < 2:
+        return bag
+    if "wheels" not in chosen:
+        rank = functools.partial(_rank, "wheels")
+        of_each = [min(spaces[one]["wheels"], key=rank) for one in robots if "wheels" in spaces[one]]
+        chosen["wheels"] = one_of("wheels", of_each)
+    others = tuple(one for one in robots if not chosen["wheels"].name.startswith(one))
+    if len(others) == len(robots):
+        return bag
+    notes.append(f"not used: {', '.join(others)}, as of other robots; name what is of this one with --topic")
+    return [topic for topic in bag if not topic.name.startswith(others)]
+
+
+def _makes_a_robot(kinds: Iterable[str]) -> bool:
+    """Whether these are wheels and another sensor."""
+    return len(held := set(kinds)) > 1 and "wheels" in held
 
 
 def _choice_notes(
@@ -217,6 +265,8 @@ def looks_fused(kind: str, topic: BagTopic) -> bool:
 
 def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool:
     name = topic.name
+    if kind == "gnss_velocity" and topic.msgtype in TYPES["gnss"]:
+        return not looks_fused("gnss", topic)
     if kind in _NAMED:
         return bool(_NAMED[kind].search(name))
     if kind in ("imu", "barometer", "magnetometer"):

@@ -23,7 +23,7 @@ TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
 _WORDS = {
     "deg/s": "deg/s|°/s|dps|degps|degs|deg_s|deg_per_s|deg/sec",
-    "rad/s": "rad/s|radps|rads|rad_s|rad/sec",
+    "rad/s": "rad/s|radps|rads|rad_s|rad/sec|rads^-1",
     "rpm": "rpm|1/min|u/min",
     "rev/s": "rev/s|rps|revps",
     "m/s": "m/s|mps|m_s|m/sec",
@@ -31,7 +31,7 @@ _WORDS = {
     "cm/s": "cm/s|cmps|cm_s",
     "mm/s": "mm/s|mmps|mm_s",
     "kn": "kn|kt|kts|knots",
-    "m/s2": "m/s2|m/s^2|m/s²|m/s/s|mps2|m_s2|ms2|ms-2",
+    "m/s2": "m/s2|m/s^2|m/s²|m/s/s|mps2|m_s2|ms2|ms-2|ms^-2",
     "m": "m|meter|metre|meters|metres",
     "ft": "ft|feet",
     "rad": "rad",
@@ -86,7 +86,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
     *(
         (
-            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}",
+            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}|w_rs_s_{a}",
             "imu",
             (f"gyro_{a}_radps",),
         )
@@ -96,7 +96,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *(
         (
             rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc|(?:total_)?acceler(?:ation|ometer))_?{a}"
-            rf"|accelerometer_m_s2_{i}",
+            rf"|accelerometer_m_s2_{i}|a_rs_s_{a}",
             "imu",
             (f"accel_{a}_mps2",),
         )
@@ -117,7 +117,8 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         (_beside("i|cur|current|motor_current", _SIDES[side]), "motor", (f"{side}_a",))
         for side in ("left", "right")
     ),
-    *((rf"(?:pos|position|truth)?_?{a}", "truth", (f"{a}_m",)) for a in "xyz"),
+    *((rf"(?:pos|position|truth)?_?{a}|p_rs_r_{a}", "truth", (f"{a}_m",)) for a in "xyz"),
+    *((rf"q_rs_{a}", "truth", (f"q{a}",)) for a in "xyzw"),
     (r"yaw|heading", "truth", ("yaw_rad",)),
 )
 """Names of columns that people often use, the channel, and its fields that they may stand for."""
@@ -135,6 +136,8 @@ _OF_FILE = (
 """Sensors whose files, by their names, may call columns just x, y, z; a linear acceleration lacks gravity."""
 _COURSE = re.compile(r"(^|_)(bearing|course|cog|g_?crs|track_angle|direction)(_|$)")
 """Names of a receiver's direction of motion, which its speed stands beside."""
+_COUNTER, _WHOLE = re.compile(r"(^|_)(enc|encoder)(_|$)"), re.compile(r"-?\d+")
+"""Whole numbers of an encoder are ticks."""
 _SCALED = 1e6
 """A latitude or longitude above that is in 1e-7 deg; heights beside it are in mm (as MAVLink has them)."""
 _LONGEST_STEP_S = 2.0
@@ -203,6 +206,8 @@ def starter_map(
             continue
         for channel, field in _guesses(header):
             if field not in channels.get(channel, {}):
+                if _COUNTER.search(header.base) and _WHOLE.fullmatch(cells.get(header.column, "")):
+                    header = replace(header, unit=header.unit or "ticks")
                 place = _place_entry(header, cells, field) if field in _HEMISPHERES else ""
                 channels.setdefault(channel, {})[field] = place or _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}

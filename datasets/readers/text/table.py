@@ -44,7 +44,9 @@ from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextC
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
+PACKED = (".csv.gz", ".tsv.gz")
 
+_OF_HOUR = re.compile(r"\d\d:\d\d\.\d+")
 SHOWN_COLUMNS = 60
 MOST_AT_ONCE = 50
 """So many rows of one time, and no other, are no log."""
@@ -56,7 +58,7 @@ TableColumns = TextColumns | ParquetColumns
 
 def claims(path: Path, head: bytes) -> bool:
     """Whether a file is Parquet, or text that ends as tables do (.txt, .dat: with rows of one length)."""
-    if head.startswith(PARQUET_MAGIC):
+    if head.startswith(PARQUET_MAGIC) or path.name.lower().endswith(PACKED):
         return True
     if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
         return False
@@ -99,6 +101,10 @@ def _few(names: list[str]) -> str:
 
 def _mapless(path: Path, columns: TableColumns) -> DataError:
     names, first = columns.names, columns.first_cells()
+    signal = next((name for name in names if name.lower() in ("signal", "variable", "name", "topic")), "")
+    if signal and "value" in map(str.lower, names):
+        what = f"is a long table: a value of one '{signal}' a line"
+        return DataError(what, remedy=f"export one column for each '{signal}', and one of time")
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
     proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)
@@ -188,9 +194,15 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
 
 
 def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64], list[str]]:
-    """Dates with times, or times of day: these begin on the day of the epoch, and go on after midnight."""
+    """Dates with times, or times of day: these begin on the day of the epoch, and go on after midnight.
+
+    So do minutes and seconds, as Excel shows times, after each hour.
+    """
     texts = columns.texts(time.column).tolist()
     plain = iso_dates(texts)
+    turn_ns = DAY_NS
+    if plain and all(map(_OF_HOUR.fullmatch, plain)):
+        plain, turn_ns = [f"00:{text}" for text in plain], DAY_NS // 24
     of_day = bool(texts) and OF_DAY.fullmatch(plain[0]) is not None
     try:
         t_ns = dates_to_ns(
@@ -206,7 +218,7 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
         zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", plain[0])
         return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
     steps = np.diff(t_ns, prepend=t_ns[:1])
-    t_ns = t_ns + DAY_NS * np.cumsum((steps < -DAY_NS // 2).astype(np.int64) - (steps > DAY_NS // 2))
+    t_ns = t_ns + turn_ns * np.cumsum((steps < -turn_ns // 2).astype(np.int64) - (steps > turn_ns // 2))
     if time.epoch in EPOCHS:
         return t_ns, ["times of day are those of 1970-01-01; 'epoch' of the column map can give the day"]
     return t_ns + dates_to_ns([time.epoch])[0], ["times without an offset are taken as UTC"]

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
+    BLANKS,
     BOM,
     MISSING,
     TextLayout,
@@ -29,6 +30,8 @@ from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
+PREFACE_LINES = 60
+"""So many lines may stand in front of a header."""
 """Rows that tell a decimal comma."""
 _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 """What may stand in front of a header for Excel."""
@@ -44,12 +47,12 @@ class TextColumns:
 
     def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
-        text = read_text(path)
+        text = read_text(path, any_encoding=True)
         self._layout = _layout(text, column_map)
+        self._preface = max(_below_preface(text) - 1, 0)
         text, self._repeated = _headed_once(text, self._layout)
-        self.units = _units_below(text, self._layout)
-        if self.units:
-            self._layout = dataclasses.replace(self._layout, first_line=self._layout.first_line + 1)
+        self.units, row = _units_below(text, self._layout)
+        self._layout = dataclasses.replace(self._layout, first_line=row)
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -62,6 +65,7 @@ class TextColumns:
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
         self.notes += [again] if self._repeated else []
+        self.notes += [f"{self._preface} lines in front of the header are left out"] if self._preface else []
         self.notes += ["the line below the header holds units; left out"] if self.units else []
 
     def first_cells(self) -> list[str]:
@@ -101,7 +105,10 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     """Names from the first line that is no comment, or from the comment before a first line of numbers;
     without a map, a first line of numbers is a row."""
     comment, header, number = "", "", 0
+    begin = _below_preface(data)
     for at, line in head_lines(data):
+        if at < begin:
+            continue
         if line.startswith(COMMENT):
             comment = line.lstrip("# ")
         elif line.strip() and not _EXCEL.fullmatch(line):
@@ -123,6 +130,26 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 
+def _below_preface(data: bytes) -> int:
+    """The line of names, from 1, where lines of other lengths stand in front of it; else 0.
+
+    It is the first of those that are as long as the first two rows of numbers, right above them.
+    """
+    lines = [
+        (at, line) for at, line in head_lines(data, PREFACE_LINES) if line.strip() and line[0] != COMMENT
+    ]
+    marks = [separator_of(line) for _, line in lines]
+    cells = [
+        split(line, mark) if mark != BLANKS else [] for (_, line), mark in zip(lines, marks, strict=True)
+    ]
+    numbers = [len(row) if sum(map(_is_number, row)) > 1 else 0 for row in cells]
+    rows = (k for k in range(len(cells) - 1) if numbers[k] == numbers[k + 1] > 2)
+    first = top = next(rows, 0)
+    while top and len(cells[top - 1]) == len(cells[first]):
+        top -= 1
+    return lines[top][0] if 0 < top < first else 0
+
+
 def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
     """The cells of the first rows."""
     for number, line in head_lines(data, layout.first_line + SAMPLE_ROWS):
@@ -141,13 +168,18 @@ def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
     return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
 
 
-def _units_below(data: bytes, layout: TextLayout) -> list[str]:
-    """The cells of a line of units below the header, without brackets; [] where that line is a row."""
-    at, line = next(((at, line) for at, line in head_lines(data) if at >= layout.first_line), (0, ""))
+def _units_below(data: bytes, layout: TextLayout) -> tuple[list[str], int]:
+    """The cells of a line of units below the header, without brackets, and the line after it.
+
+    [] and the first line where that one is a row.
+    """
+    below = ((at, line) for at, line in head_lines(data) if at >= layout.first_line and line.strip())
+    at, line = next(below, (0, ""))
     cells = [cell.strip("[]() ") for cell in split(line, layout.separator)] if at > 1 else []
     rows = any(number_in(cell) is not None or re.search(r"\d\d", cell) for cell in cells)
     known = any(cell.replace(" ", "").lower() in UNIT_OF for cell in cells)
-    return cells if known and not rows and len(cells) == len(layout.names) else []
+    found = known and not rows and len(cells) == len(layout.names)
+    return (cells, at + 1) if found else ([], layout.first_line)
 
 
 def _begin(data: bytes, line: int) -> int:
@@ -166,6 +198,10 @@ def _headed_once(data: bytes, layout: TextLayout) -> tuple[bytes, int]:
         return data, 0
     rows, count = re.subn(rb"(?<=\n)" + re.escape(header) + rb"\r?(?=\n)", b"", data[end - 1 :])
     return (type(data)(data[: end - 1] + rows), count) if count else (data, 0)
+
+
+def _is_number(cell: str) -> bool:
+    return number_in(cell.replace(",", ".")) is not None
 
 
 def _is_value(cell: str) -> bool:

@@ -12,7 +12,7 @@ from terrafusion.datasets.checks import scale
 from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.path import PathScale, scales
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
-from terrafusion.datasets.core.channels import Wheels
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from tests.datasets.conftest import RADIUS_M, make_drive
@@ -330,11 +330,37 @@ def test_the_truth_tells_the_scale_of_the_gyro(drive: Recording) -> None:
         assert (scale._by_truth(shorter) is not None) == enough
 
 
-@pytest.mark.parametrize(("windows", "used"), [(7, None), (8, "the path of the truth")])
-def test_a_path_of_few_stretches_tells_none(
-    drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, used: str | None
+@pytest.mark.parametrize("factor", [0.92, 1.1])
+def test_the_path_tells_by_how_much_the_gyro_is_wrong(factor: float) -> None:
+    """A repair by the path made 1.1 times the turns 1.21 times."""
+    t_s = np.arange(0.0, 300.0, 0.05)
+    rate = 0.4 * np.sin(2.0 * np.pi * t_s / 41.0) + 0.1
+    place = np.cumsum(np.exp(1j * np.cumsum(rate) * 0.05)) * 0.05
+    t_ns, zero = np.round(t_s * 1e9).astype(np.int64), np.zeros(len(t_s))
+    log = Recording(
+        name="bends", start_ns=0,
+        wheels=Wheels(t_ns, np.ones((len(t_s), 2)), ("left", "right"), unit="mps"),
+        imu=Imu(t_ns, factor * np.column_stack([zero, zero, rate]), np.tile([0.0, 0.0, 9.81], (len(t_s), 1))),
+        truth=Trajectory(t_ns, np.column_stack([place.real, place.imag, zero])),
+    )  # fmt: skip
+    (found,) = scale.check_gyro_scale(CheckContext(log, None))
+    assert found.what.startswith(
+        "gyro z reads 10.0% too much" if factor > 1.0 else "gyro z reads 8.0% too li"
+    )
+    assert found.repair is not None
+    repaired = found.repair(log).imu
+    assert repaired is not None
+    assert repaired.gyro_radps[:, 2] == pytest.approx(rate, rel=2e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("windows", "low", "used"),
+    [(7, 0.04, None), (8, 0.04, "the path of the truth"), (7, 0.0501, "the path of the truth")],
+)
+def test_a_path_of_few_stretches_tells_clear_errors_only(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, windows: int, low: float, used: str | None
 ) -> None:
-    error = BootstrapInterval(0.05, 0.04, 0.06)
+    error = BootstrapInterval(0.06, low, 0.07)
     model = SimpleNamespace(windows=windows, gyro_scale=error)
     monkeypatch.setattr(scale, "model_by_fixes", lambda _: None)
     monkeypatch.setattr(scale, "model_by_truth", lambda _: model)

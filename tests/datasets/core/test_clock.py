@@ -46,6 +46,15 @@ def test_a_good_clock_is_left_alone() -> None:
     assert jumps == ()
 
 
+@pytest.mark.parametrize("turn_s", [2**32 / 1e3, 2**32 / 1e6, 604_800.0, 3600.0])
+def test_a_counter_that_wraps_is_repaired_exactly(turn_s: float) -> None:
+    true = ticks(jitter=0.4)
+    true[500:] += 200 * MS  # it wraps in a gap
+    repaired, jumps = repair(stepped(true, (500, -turn_s)), "imu")
+    assert repaired.tolist() == true.tolist()
+    assert [jump.step_s for jump in jumps] == [-turn_s]
+
+
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_short_channels(n: int) -> None:
     t = ticks(n)

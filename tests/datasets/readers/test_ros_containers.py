@@ -255,6 +255,20 @@ def test_unknown_types_elsewhere_do_no_harm(tmp_path: Path) -> None:
     assert len(imu) == 400
 
 
+def test_messages_of_other_encodings_are_named(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.LocationFix", "jsonschema", b"{}")
+        channel = writer.register_channel("/gps", "json", schema)
+        writer.add_message(channel, T0, b'{"latitude": 48.0}', T0)
+        writer.finish()
+    with pytest.raises(DataError, match="messages in json are not read: export them as tables"):
+        open_recording(tmp_path / "a.mcap")
+
+
 def test_a_definition_that_does_not_fit_is_told(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", "")
     path.write_bytes(path.read_bytes().replace(b"float64 x", b"float32 x"))

@@ -206,8 +206,14 @@ def test_fixes_with_speed_and_track_are_read(kind: str, tmp_path: Path) -> None:
             database.execute("update message_definitions set encoded_message_definition = ''")
             database.commit()
     gnss = open_recording(bag).gnss
+    messages += [("/fix", "sensor_msgs/msg/NavSatFix", t, make.fix(t, 48.0, 11.0)) for t in TIMES]
+    both = (write_ros1 if kind == "ROS 1" else write_ros2)(tmp_path / "both.bag", messages)
+    of_both = open_recording(both).gnss
     assert gnss is not None
+    assert of_both is not None
     assert gnss.velocity_enu_mps is not None
+    np.testing.assert_array_equal(of_both.velocity_enu_mps, gnss.velocity_enu_mps)
+    np.testing.assert_array_equal(of_both.sigma_v_mps, gnss.sigma_v_mps)
     assert gnss.sigma_v_mps is not None
     np.testing.assert_allclose(gnss.velocity_enu_mps[1:, :2], [[1.5, 0.0]] * (len(TIMES) - 1), atol=1e-12)
     assert np.isnan(gnss.velocity_enu_mps[0]).all()  # live, nothing tells rest from a speed that is not set

@@ -13,11 +13,11 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.arriving import LIVE, ArrivingMessages, RawMessage
-from terrafusion.datasets.readers.ros.topics import BagTopic
+from terrafusion.datasets.readers.ros.topics import FIX, BagTopic
 from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.datasets.ros_bags import MAKE2, T0, Message, imu_messages, write_ros2
+from tests.datasets.ros_bags import MAKE2, T0, Message, imu_messages, odometry_messages, write_ros2
 
 JOINTS = "sensor_msgs/msg/JointState"
 TURN = 2.0 * np.pi
@@ -130,6 +130,43 @@ def test_seldom_wheels_without_numbers_are_left_out_as_of_an_imu(tmp_path: Path)
     assert recording.wheels is not None
     assert recording.wheels.speed.tolist() == [[2.0, 2.0]] * 199
     assert any("1 of 200 messages of /base/joints hold no number" in note for note in recording.notes)
+
+
+def two_robots(path: Path, a: str, b: str) -> Path:
+    """Robot `a` has an IMU and joints, robot `b` an odometry and an IMU or fixes."""
+    joints = [
+        (
+            f"{a}/joint_states",
+            JOINTS,
+            T0 + i * 10**8,
+            MAKE2.joints(T0 + i * 10**8, ["left", "right"], [], [3.0, 4.0]),
+        )
+        for i in range(9)
+    ]
+    fixes = [(f"{b}/fix", FIX, T0 + i * 10**8, MAKE2.fix(T0 + i * 10**8, 46.0, 7.0)) for i in range(9)]
+    own = [*imu_messages(MAKE2, f"{a}/imu"), *joints]
+    return write_ros2(path, [*own, *odometry_messages(MAKE2, f"{b}/odom"), *fixes])
+
+
+@pytest.mark.parametrize(("a", "b"), [("/alice", "/bob"), ("/fleet/husky_1", "/fleet/husky_2")])
+def test_of_two_robots_in_a_bag_one_is_asked_for(tmp_path: Path, a: str, b: str) -> None:
+    path = two_robots(tmp_path / "bag", a, b)
+    with pytest.raises(DataError, match=f"--topic wheels={a}/joint_states or --topic wheels={b}/odom"):
+        open_recording(path)
+    first = open_recording(path, topics={"wheels": f"{a}/joint_states"})
+    assert set(first.channels()) == {"imu", "wheels"}
+    assert any(f"not used: {b}/" in note for note in first.notes)
+    second = open_recording(path, topics={"wheels": f"{b}/odom"})
+    assert set(second.channels()) == {"gnss", "wheels"}
+    mixed = open_recording(path, topics={"wheels": f"{b}/odom", "imu": f"{a}/imu"})
+    assert set(mixed.channels()) == {"imu", "gnss", "wheels"}
+
+
+def test_wheels_of_one_robot_are_not_joined_with_the_imu_of_its_twin(tmp_path: Path) -> None:
+    messages = [*imu_messages(MAKE2, "/robot_a/imu"), *odometry_messages(MAKE2, "/robot_b/odom")]
+    assert set(open_recording(write_ros2(tmp_path / "two", messages)).channels()) == {"wheels"}
+    messages = [*imu_messages(MAKE2, "/sensors/imu"), *odometry_messages(MAKE2, "/base/odom")]
+    assert set(open_recording(write_ros2(tmp_path / "one", messages)).channels()) == {"imu", "wheels"}
 
 
 def bag_beside_imu(path: Path, topic: str, msgtype: str, *messages: Any) -> Path:

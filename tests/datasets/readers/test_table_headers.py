@@ -1,5 +1,6 @@
 """Tables as loggers write them: units in headers, ticks of encoders, decimal commas."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -95,19 +96,75 @@ def test_a_comma_between_words_is_no_decimal_comma(tmp_path: Path) -> None:
     assert recording.terrain.label[0] == "mud, wet"
 
 
-def test_text_in_utf_16_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "excel.csv"
-    path.write_text("t_s,speed_mps\n0,1\n", encoding="utf-16")
-    with pytest.raises(DataError, match=r"excel\.csv: is text in UTF-16; save it as UTF-8"):
-        open_recording(path)
-
-
-def proposed(folder: Path, text: str) -> Recording:
-    path = table(folder, text, None)
+def proposed(folder: Path, text: str, encoding: str = "utf-8") -> Recording:
+    path = table(folder, "", None)
+    path.write_bytes(text.encode(encoding))
     with pytest.raises(DataError) as told:
         open_recording(path)
     path.with_name("drive.csv.columns.yaml").write_text(str(told.value).split(".columns.yaml: ", 1)[1])
     return open_recording(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+def test_any_encoding_of_a_table_is_read(tmp_path: Path, encoding: str) -> None:
+    rows = "".join(f"{k / 10:.1f}\t90\t2,0\n" for k in range(9)).replace(".", ",")
+    recording = proposed(tmp_path, f"t\tgz [°/s]\tspeed [m/s]\n{rows}", encoding)
+    assert recording.imu is not None
+    np.testing.assert_allclose(recording.imu.gyro_radps[:, 2], [np.pi / 2] * 9)
+
+
+def test_a_packed_table_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv.gz"
+    path.write_bytes(gzip.compress(b"t,wz\n0,1\n1,2\n"))
+    (tmp_path / "drive.csv.gz.columns.yaml").write_text(GYRO_MAP)
+    assert len(open_recording(path).channels()["imu"]) == 2
+
+
+@pytest.mark.parametrize("units", ["", "s,deg/s,km/h\n\n", "t,gz,speed\ns,deg/s,km/h\n"])
+@pytest.mark.parametrize(
+    "preface", ["Logger v1.2, unit 7\n\n", '"Format","CSV File",,"Robot"\n"Duration","150","s","",\n']
+)
+def test_lines_in_front_of_the_header_are_left_out(tmp_path: Path, preface: str, units: str) -> None:
+    recording = proposed(tmp_path, f"{preface}t,gz,speed\n{units}0,90,7.2\n0.1,90,7.2\n")
+    assert recording.imu is not None
+    assert recording.wheels is not None
+    assert recording.wheels.speed[0, 0] == pytest.approx(2.0 if units else 7.2)
+    assert any("in front of the header" in note for note in recording.notes)
+
+
+def test_columns_of_euroc_are_proposed(tmp_path: Path) -> None:
+    places = ",".join(
+        f"{name}_{axis} [{unit}]"
+        for name, unit in (("w_RS_S", "rad s^-1"), ("a_RS_S", "m s^-2"))
+        for axis in "xyz"
+    )
+    recording = proposed(tmp_path, f"#timestamp [ns],{places}\n1714564800000000000,1,2,3,4,5,6\n")
+    assert recording.imu is not None
+    assert np.hstack([recording.imu.gyro_radps, recording.imu.accel_mps2]).tolist() == [[1, 2, 3, 4, 5, 6]]
+    poses = ",".join([*(f"p_RS_R_{axis} [m]" for axis in "xyz"), *(f"q_RS_{axis} []" for axis in "wxyz")])
+    (tmp_path / "drive.csv.columns.yaml").unlink()
+    recording = proposed(tmp_path, f"#timestamp,{poses}\n1714564800000000000,1,2,3,0,0,0,1\n")
+    assert recording.truth is not None
+    assert recording.truth.quaternion is not None
+    assert recording.truth.quaternion.tolist() == [[0, 0, 1, 0]]
+
+
+def test_a_long_table_is_named(tmp_path: Path) -> None:
+    path = table(tmp_path, "time,id,Signal,Value\n0,0x181,WheelSpeedLeft,1.5\n0,0x201,YawRate,0.2\n", None)
+    with pytest.raises(DataError, match=r"a long table: .*export one column for each 'Signal'"):
+        open_recording(path)
+
+
+def test_whole_numbers_of_encoders_are_proposed_as_ticks() -> None:
+    names = ["t", "enc_left", "enc_right"]
+    assert "unit: rev, scale: 1/1024" in starter_map(names, ["0", "-12", "7"])
+    assert "unit: rev" not in starter_map(names, ["0", "-0.12", "0.7"])
+
+
+def test_minutes_and_seconds_go_on_after_the_hour(tmp_path: Path) -> None:
+    recording = proposed(tmp_path, "t,gz\n59:59.9,1\n00:00.4,2\n")
+    assert recording.imu is not None
+    assert np.diff(recording.imu.t_ns).tolist() == [500_000_000]
 
 
 def test_a_line_of_units_below_the_header_is_proposed(tmp_path: Path) -> None:

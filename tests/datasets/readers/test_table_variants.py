@@ -41,13 +41,6 @@ def test_a_header_that_comes_again_is_left_out(end: str, tmp_path: Path) -> None
     assert any("the header comes 2 more times" in note for note in recording.notes)
 
 
-def test_another_encoding_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_bytes("t,gz,heading (°)\n0,1,2\n".encode("latin-1"))
-    with pytest.raises(DataError, match="UTF-8"):
-        open_recording(path)
-
-
 @pytest.mark.parametrize("field", ["p_radps", "q_radps"])
 def test_roll_and_pitch_rates_have_units(field: str, tmp_path: Path) -> None:
     channels = f"truth: {{x_m: x, y_m: y, u_mps: x, v_mps: y, {field}: {{column: p, unit: deg/s}}}}"
