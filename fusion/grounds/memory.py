@@ -111,16 +111,16 @@ class GroundMemory:
         return nan_mean(list(self._recent))
 
     def _log_likelihoods(self, signature: Array) -> Array:
-        """(1 + K,) of new ground, then of each; new ground is what lies `NOVEL` from all others.
+        """(1 + K,) of new ground, then of each; new is what lies `NOVEL` from the nearest one.
 
-        Its own spread is that of any ground: what makes it new is its distance, as in DP-means.
+        Distance is counted from the middle of the nearest: beside that of a ground known for long, whose
+        spread is small, what lies in the middle of a young one would seem far.
         """
         wider = 1.0 + WINDOW_VARIANCE * (1.0 / len(self._recent) - 1.0 / SLOW)
         found = np.array([g.log_likelihood(signature, wider) for g in self.grounds])
-        seen = np.isfinite(signature)
-        middles = [np.where(seen, g.signature.mean, np.nan) for g in self.grounds]
-        best = max(g.log_likelihood(m, wider) for g, m in zip(self.grounds, middles, strict=True))
-        return np.append(best - NOVEL, found)
+        nearest = self.grounds[int(found.argmax())]
+        middle = np.where(np.isfinite(signature), nearest.signature.mean, np.nan)
+        return np.append(nearest.log_likelihood(middle, wider) - NOVEL, found)
 
     def learn(self, date: str, friction: Array | None = None) -> None:
         """Add the newest windows to their ground; to a new one where none explains them for long enough.

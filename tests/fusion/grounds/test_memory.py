@@ -21,9 +21,11 @@ from terrafusion.fusion.terrain.features import Window
 SMOOTH, ROUGH = 1.2, 2.0
 
 
-def signature(level: float, rng: np.random.Generator, yaw_slip: float = 0.4) -> np.ndarray:
+def signature(
+    level: float, rng: np.random.Generator, yaw_slip: float = 0.4, spread: float = 0.2
+) -> np.ndarray:
     out = np.full(len(SIGNATURE), np.nan)
-    out[: len(VIBRATION)] = level + 0.2 * rng.normal(size=len(VIBRATION))
+    out[: len(VIBRATION)] = level + spread * rng.normal(size=len(VIBRATION))
     out[SIGNATURE.index("yaw_slip")] = yaw_slip + 0.05 * rng.normal()
     return out
 
@@ -62,6 +64,16 @@ def test_one_ground_stays_one() -> None:
     memory, rng = GroundMemory(), np.random.default_rng(3)
     drive(memory, SMOOTH, rng, 400)
     assert len(memory.condensed()) == 1
+
+
+def test_a_ground_met_late_is_learned_beside_one_known_for_long() -> None:
+    """Its spread is not known yet; that of the first is small, which says nothing of the second."""
+    memory, rng = GroundMemory(), np.random.default_rng(7)
+    for level in (SMOOTH,) * 600 + (SMOOTH + 0.4,) * 100:
+        memory.recognise(signature(level, rng, spread=0.06), 0.5)
+        memory.learn("")
+    assert len(memory) == 2
+    assert memory.grounds[1].windows > 80
 
 
 def test_a_ground_is_not_made_by_a_few_strange_windows() -> None:
