@@ -94,6 +94,7 @@ class TerrainNoise:
         self.window: Window | None = None
         self._last_speed = np.nan
         self._source = "detector"
+        self._external_ns: int | None = None
 
     def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
         """Take over the slip that the robot itself shows: mean and sigma for the ground that no class
@@ -207,7 +208,9 @@ class TerrainNoise:
                 remedy=f"the policy knows {', '.join(self.detector.classes)}",
             )
         given = [probabilities.get(name, 0.0) for name in self.detector.classes]
-        self.detector.fuse(as_numbers(given, "probabilities", "terrain"))
+        since_ns = UPDATE_NS if self._external_ns is None else abs(t_ns - self._external_ns)
+        self.detector.fuse(as_numbers(given, "probabilities", "terrain"), min(since_ns / UPDATE_NS, 1.0))
+        self._external_ns = t_ns
         self._source = "external source"
         self._reweight(t_ns)
 
