@@ -16,6 +16,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
+from terrafusion.fusion.grounds.signature import FELT, SIGNATURE
 
 PATCH_M = 25.0
 """Expected length of a patch, as of the detector."""
@@ -36,6 +37,7 @@ ALIKE = 0.5
 """Mean squared distance of two signatures, in their spreads, below which they are one ground."""
 LEAST_WINDOWS = 30.0
 """Windows from which a ground may be compared with others."""
+SLIP = SIGNATURE.index("slip")
 
 
 class GroundMemory:
@@ -54,6 +56,7 @@ class GroundMemory:
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
         self.left_out = 0
+        self._today = [0.0] * len(self.grounds)  # windows of this drive, with fixes
 
     def __repr__(self) -> str:
         """A line a ground."""
@@ -118,9 +121,22 @@ class GroundMemory:
         """
         wider = 1.0 + WINDOW_VARIANCE * (1.0 / len(self._recent) - 1.0 / SLOW)
         found = np.array([g.log_likelihood(signature, wider) for g in self.grounds])
+        if np.isnan(signature[SLIP]):
+            found[self._changed()] = -np.inf
         nearest = self.grounds[int(found.argmax())]
         middle = np.where(np.isfinite(signature), nearest.signature.mean, np.nan)
         return np.append(nearest.log_likelihood(middle, wider) - NOVEL, found)
+
+    def _changed(self) -> list[int]:
+        """Places of grounds that feel like one that this drive has shown, and that it has not shown: tyres or
+        weather may have changed since they slipped otherwise, and without fixes today's slip is expected.
+        """
+        shown = [i for i, windows in enumerate(self._today) if windows >= LEAST_WINDOWS]
+        return [
+            i
+            for i, ground in enumerate(self.grounds)
+            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in shown)
+        ]
 
     def learn(self, date: str, friction: Array | None = None) -> None:
         """Add the newest windows to their ground; to a new one where none explains them for long enough.
@@ -142,6 +158,11 @@ class GroundMemory:
             weight = float(self.belief[best])
             ground = self.grounds[best - 1].seen(signature, weight, date)
             self.grounds[best - 1] = ground if friction is None else ground.with_friction(friction, weight)
+            self._today[best - 1] += weight
+
+    def forget_slip(self, place: int) -> None:
+        """Learn the slip of a ground anew, as it is no more what it was."""
+        self.grounds[place] = self.grounds[place].without_slip()
 
     def _found(self, date: str) -> None:
         names = {g.name for g in self.grounds}
@@ -152,6 +173,7 @@ class GroundMemory:
             ground = ground.seen(signature, 1.0, date)
         self._waiting.clear()
         self.grounds.append(ground)
+        self._today.append(ground.windows)
         belief = np.append(self.belief, self.belief[0])
         belief[0] = NEW_SHARE * belief[-1]
         self.belief = belief / belief.sum()
@@ -210,11 +232,19 @@ def alike(a: Ground, b: Ground) -> bool:
     named = [g.name for g in (a, b) if not g.name.startswith("ground ")]
     if len(set(named)) == 2:
         return False
-    both = (a.signature.count > 0.0) & (b.signature.count > 0.0)
+    return distance(a, b) < ALIKE
+
+
+def distance(a: Ground, b: Ground, numbers: slice = slice(None)) -> float:
+    """Mean square distance of two signatures in their spreads, over `numbers` that both have; infinite where
+    there are none.
+    """
+    both = np.zeros(len(SIGNATURE), dtype=bool)
+    both[numbers] = ((a.signature.count > 0.0) & (b.signature.count > 0.0))[numbers]
     if not both.any():
-        return False
+        return math.inf
     square = (a.signature.mean - b.signature.mean)[both] ** 2 / (a.variance() + b.variance())[both]
-    return float(square.mean()) < ALIKE
+    return float(square.mean())
 
 
 def nan_mean(rows: Sequence[Array]) -> Array:

@@ -252,8 +252,9 @@ class TerrainNoise:
             return
         if not window.ground_speed_mps() > MIN_SPEED_MPS:
             return
-        if self._starts_pooled:
-            self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s)
+        if self._starts_pooled and self.grounds is not None:
+            for place in self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s):
+                self.grounds.memory.forget_slip(place)
         self._driven.add(self._shares, window.slip, window.slip_sigma, self._grade, window.dt_s)
         self._slips = self._driven.posterior()
 

@@ -76,6 +76,26 @@ def test_a_ground_met_late_is_learned_beside_one_known_for_long() -> None:
     assert memory.grounds[1].windows > 80
 
 
+def test_without_fixes_a_ground_is_that_of_today_where_an_earlier_one_felt_the_same() -> None:
+    """Tyres are changed overnight: the ground feels as before, and slips by .05, not by .3."""
+    rng, slip = np.random.default_rng(11), SIGNATURE.index("slip")
+
+    def driven(memory: GroundMemory, slipping: float, windows: int) -> None:
+        for _ in range(windows):
+            window = signature(SMOOTH, rng, spread=0.06)
+            window[slip] = slipping + 0.01 * rng.normal()
+            memory.recognise(window, 0.5)
+            memory.learn("")
+
+    monday = GroundMemory()
+    driven(monday, 0.3, 400)
+    tuesday = monday.condensed()
+    driven(tuesday, 0.05, 60)
+    for _ in range(40):
+        tuesday.recognise(signature(SMOOTH, rng, spread=0.06), 0.5)
+    assert tuesday.belief.argmax() == len(tuesday) == 2
+
+
 def test_a_ground_is_not_made_by_a_few_strange_windows() -> None:
     memory, rng = GroundMemory(), np.random.default_rng(4)
     drive(memory, SMOOTH, rng, 100)
