@@ -138,20 +138,27 @@ class GroundMemory:
             if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in shown)
         ]
 
-    def learn(self, date: str, friction: Array | None = None) -> None:
+    def learn(self, date: str, friction: Array | None = None) -> int | None:
         """Add the newest windows to their ground; to a new one where none explains them for long enough.
 
         `friction` (10,) are probabilities of friction limits by the fixes, where they are known.
+
+        Returns:
+            place of a ground that was seen too little to be kept, and that a new one has taken.
         """
         if not self._recent:
-            return
+            return None
         signature = nan_mean(list(self._recent))
         best = int(self.belief.argmax())
-        if best == 0 and len(self.grounds) < MOST_GROUNDS:
+        place, full = len(self), len(self) >= MOST_GROUNDS
+        if full:
+            place = min(range(place), key=lambda i: self.grounds[i].windows)
+        if best == 0 and not (full and self.grounds[place].windows >= LEAST_WINDOWS):
             self._waiting.append(signature)
-            if len(self._waiting) >= DWELL:
-                self._found(date)
-            return
+            if len(self._waiting) < DWELL:
+                return None
+            self._found(date, place)
+            return place if full else None
         self._waiting.clear()
         self.left_out += best == 0
         if best:
@@ -159,12 +166,14 @@ class GroundMemory:
             ground = self.grounds[best - 1].seen(signature, weight, date)
             self.grounds[best - 1] = ground if friction is None else ground.with_friction(friction, weight)
             self._today[best - 1] += weight
+        return None
 
     def forget_slip(self, place: int) -> None:
         """Learn the slip of a ground anew, as it is no more what it was."""
         self.grounds[place] = self.grounds[place].without_slip()
 
-    def _found(self, date: str) -> None:
+    def _found(self, date: str, place: int) -> None:
+        """Make the waiting windows a ground at a place: that of another, or behind all."""
         names = {g.name for g in self.grounds}
         name = next(f"ground {i}" for i in range(1, MOST_GROUNDS + 2) if f"ground {i}" not in names)
         origin = hashlib.sha256(np.array(self._waiting).tobytes()).hexdigest()[:16]
@@ -172,11 +181,11 @@ class GroundMemory:
         for signature in self._waiting:
             ground = ground.seen(signature, 1.0, date)
         self._waiting.clear()
-        self.grounds.append(ground)
-        self._today.append(ground.windows)
-        belief = np.append(self.belief, self.belief[0])
-        belief[0] = NEW_SHARE * belief[-1]
-        self.belief = belief / belief.sum()
+        self.grounds[place : place + 1], self._today[place : place + 1] = [ground], [ground.windows]
+        belief = self.belief.tolist()
+        belief[1 + place : 2 + place] = belief[:1]
+        belief[0] *= NEW_SHARE
+        self.belief = np.array(belief) / np.array(belief).sum()
 
     def named(self, names: dict[str, str]) -> "GroundMemory":
         """With grounds renamed: old name -> new name; two of one name become one ground."""

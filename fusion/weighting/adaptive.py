@@ -229,7 +229,9 @@ class TerrainNoise:
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
-            self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
+            replaced = self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
+            if replaced is not None:
+                self._ground_slip.clear(replaced)
             self._ground_slip.recognise(self.grounds.memory.belief)
             self.found_ground = ""
             if int(self._probabilities.argmax()) == self._unknown:

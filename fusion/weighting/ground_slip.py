@@ -89,6 +89,12 @@ class GroundSlip:
             self.expect(*self._whole)
         return [i - 1 for i in stale]
 
+    def clear(self, place: int) -> None:
+        """Another ground has taken a place in the memory."""
+        self._slip.clear(1 + place)
+        if self._known.pop(1 + place, None) is not None:
+            self.expect(*self._whole)
+
     def known(self) -> dict[int, tuple[float, float]]:
         """Slip and its 1 sigma of the grounds that the drive has shown clearly, by place in the memory."""
         means, sigmas = self._slip.posterior()

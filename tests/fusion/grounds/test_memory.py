@@ -208,6 +208,23 @@ def test_a_full_memory_counts_what_it_leaves_out() -> None:
     assert memory.left_out > 40
 
 
+def test_a_new_ground_takes_the_place_of_one_that_is_too_short_to_be_kept() -> None:
+    """Changes of ground leave short ones behind, more of them the longer a drive lasts."""
+    rng, places, grounds = np.random.default_rng(12), list[int | None](), list[Ground]()
+    for i in range(MOST_GROUNDS):
+        ground = Ground.new(f"ground {i + 1}")
+        for _ in range(10 if i == 3 else 50):
+            ground = ground.seen(np.full(len(SIGNATURE), 4.0 + i), 1.0, "")
+        grounds.append(ground)
+    memory = GroundMemory(grounds)
+    for _ in range(60):
+        memory.recognise(signature(SMOOTH, rng), 0.5)
+        places.append(memory.learn(""))
+    assert {place for place in places if place is not None} == {3}
+    assert (len(memory), memory.left_out) == (MOST_GROUNDS, 0)
+    assert memory.grounds[3].windows > 40
+
+
 def test_many_grounds_of_several_robots_still_fit_into_a_file(tmp_path: Path) -> None:
     """Those that were seen longest are kept."""
     levels = np.linspace(-4.0, 4.0, MOST_GROUNDS + 3)
