@@ -124,6 +124,12 @@ class Ground:
         mean = self.friction + weight / n * (friction - self.friction)
         return dataclasses.replace(self, friction=mean, friction_windows=n)
 
+    def without_slip(self) -> "Ground":
+        """As it feels, without what it does to the wheels."""
+        count = np.where(np.array(SIGNATURE) == "slip", 0.0, self.signature.count)
+        signature = dataclasses.replace(self.signature, count=count)
+        return dataclasses.replace(self, signature=signature, motion=Tally.empty(2))
+
     def same_as(self, other: "Ground") -> bool:
         """Whether both are one ground at different times, or hold the same numbers, by whatever name."""
         mine, others = (

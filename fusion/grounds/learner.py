@@ -55,25 +55,32 @@ class GroundLearner:
         self._extractor, self._meter = SignatureExtractor(), StretchMeter()
         self._passed: list[int] = []  # most probable ground of each window of the stretch
 
-    def update(self, window: Window, state: State, rolled_m: float, friction: FrictionBank | None) -> None:
-        """One window that ends at `state`, in which the wheels rolled `rolled_m` since the last one."""
-        memory, good = self.memory, state.status == "running"
+    def update(
+        self, window: Window, state: State, rolled_m: float, friction: FrictionBank | None
+    ) -> int | None:
+        """One window that ends at `state`, in which the wheels rolled `rolled_m` since the last one.
+
+        Returns:
+            place of a ground in the memory that a new one has taken.
+        """
+        replaced, memory, good = None, self.memory, state.status == "running"
         known = friction.probabilities() if friction is not None and good else None
         slide = math.nan if known is None else float(known[:SLIPPERY_MODELS].sum())
         signature = self._extractor.extract(window, slide)
         if np.isfinite(signature).any():
             memory.recognise(signature, window.ground_speed_mps() * max(window.dt_s, 0.0))
             if good:
-                memory.learn(_date(state.t_ns), known)
+                replaced = memory.learn(_date(state.t_ns), known)
         if not good or (friction is not None and friction.leads):  # skidding wheels measure no slip
             self._meter.restart()
             self._passed.clear()
-            return
+            return replaced
         self._passed.append(int(memory.belief.argmax()))
         stretch = self._meter.add(state, rolled_m)
         if stretch is not None:
             self._learn_stretch(stretch)
             self._passed.clear()
+        return replaced
 
     def _learn_stretch(self, stretch: SlipStretch) -> None:
         best, windows = Counter(self._passed).most_common(1)[0]

@@ -16,6 +16,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
+from terrafusion.fusion.grounds.signature import FELT, SIGNATURE
 
 PATCH_M = 25.0
 """Expected length of a patch, as of the detector."""
@@ -36,6 +37,7 @@ ALIKE = 0.5
 """Mean squared distance of two signatures, in their spreads, below which they are one ground."""
 LEAST_WINDOWS = 30.0
 """Windows from which a ground may be compared with others."""
+SLIP = SIGNATURE.index("slip")
 
 
 class GroundMemory:
@@ -54,6 +56,7 @@ class GroundMemory:
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
         self.left_out = 0
+        self._today = [0.0] * len(self.grounds)  # windows of this drive, with fixes
 
     def __repr__(self) -> str:
         """A line a ground."""
@@ -111,39 +114,66 @@ class GroundMemory:
         return nan_mean(list(self._recent))
 
     def _log_likelihoods(self, signature: Array) -> Array:
-        """(1 + K,) of new ground, then of each; new ground is what lies `NOVEL` from all others.
+        """(1 + K,) of new ground, then of each; new is what lies `NOVEL` from the nearest one.
 
-        Its own spread is that of any ground: what makes it new is its distance, as in DP-means.
+        Distance is counted from the middle of the nearest: beside that of a ground known for long, whose
+        spread is small, what lies in the middle of a young one would seem far.
         """
         wider = 1.0 + WINDOW_VARIANCE * (1.0 / len(self._recent) - 1.0 / SLOW)
         found = np.array([g.log_likelihood(signature, wider) for g in self.grounds])
-        seen = np.isfinite(signature)
-        middles = [np.where(seen, g.signature.mean, np.nan) for g in self.grounds]
-        best = max(g.log_likelihood(m, wider) for g, m in zip(self.grounds, middles, strict=True))
-        return np.append(best - NOVEL, found)
+        if np.isnan(signature[SLIP]):
+            found[self._changed()] = -np.inf
+        nearest = self.grounds[int(found.argmax())]
+        middle = np.where(np.isfinite(signature), nearest.signature.mean, np.nan)
+        return np.append(nearest.log_likelihood(middle, wider) - NOVEL, found)
 
-    def learn(self, date: str, friction: Array | None = None) -> None:
+    def _changed(self) -> list[int]:
+        """Places of grounds that feel like one that this drive has shown, and that it has not shown: tyres or
+        weather may have changed since they slipped otherwise, and without fixes today's slip is expected.
+        """
+        shown = [i for i, windows in enumerate(self._today) if windows >= LEAST_WINDOWS]
+        return [
+            i
+            for i, ground in enumerate(self.grounds)
+            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in shown)
+        ]
+
+    def learn(self, date: str, friction: Array | None = None) -> int | None:
         """Add the newest windows to their ground; to a new one where none explains them for long enough.
 
         `friction` (10,) are probabilities of friction limits by the fixes, where they are known.
+
+        Returns:
+            place of a ground that was seen too little to be kept, and that a new one has taken.
         """
         if not self._recent:
-            return
+            return None
         signature = nan_mean(list(self._recent))
         best = int(self.belief.argmax())
-        if best == 0 and len(self.grounds) < MOST_GROUNDS:
+        place, full = len(self), len(self) >= MOST_GROUNDS
+        if full:
+            place = min(range(place), key=lambda i: self.grounds[i].windows)
+        if best == 0 and not (full and self.grounds[place].windows >= LEAST_WINDOWS):
             self._waiting.append(signature)
-            if len(self._waiting) >= DWELL:
-                self._found(date)
-            return
+            if len(self._waiting) < DWELL:
+                return None
+            self._found(date, place)
+            return place if full else None
         self._waiting.clear()
         self.left_out += best == 0
         if best:
             weight = float(self.belief[best])
             ground = self.grounds[best - 1].seen(signature, weight, date)
             self.grounds[best - 1] = ground if friction is None else ground.with_friction(friction, weight)
+            self._today[best - 1] += weight
+        return None
 
-    def _found(self, date: str) -> None:
+    def forget_slip(self, place: int) -> None:
+        """Learn the slip of a ground anew, as it is no more what it was."""
+        self.grounds[place] = self.grounds[place].without_slip()
+
+    def _found(self, date: str, place: int) -> None:
+        """Make the waiting windows a ground at a place: that of another, or behind all."""
         names = {g.name for g in self.grounds}
         name = next(f"ground {i}" for i in range(1, MOST_GROUNDS + 2) if f"ground {i}" not in names)
         origin = hashlib.sha256(np.array(self._waiting).tobytes()).hexdigest()[:16]
@@ -151,10 +181,11 @@ class GroundMemory:
         for signature in self._waiting:
             ground = ground.seen(signature, 1.0, date)
         self._waiting.clear()
-        self.grounds.append(ground)
-        belief = np.append(self.belief, self.belief[0])
-        belief[0] = NEW_SHARE * belief[-1]
-        self.belief = belief / belief.sum()
+        self.grounds[place : place + 1], self._today[place : place + 1] = [ground], [ground.windows]
+        belief = self.belief.tolist()
+        belief[1 + place : 2 + place] = belief[:1]
+        belief[0] *= NEW_SHARE
+        self.belief = np.array(belief) / np.array(belief).sum()
 
     def named(self, names: dict[str, str]) -> "GroundMemory":
         """With grounds renamed: old name -> new name; two of one name become one ground."""
@@ -210,11 +241,19 @@ def alike(a: Ground, b: Ground) -> bool:
     named = [g.name for g in (a, b) if not g.name.startswith("ground ")]
     if len(set(named)) == 2:
         return False
-    both = (a.signature.count > 0.0) & (b.signature.count > 0.0)
+    return distance(a, b) < ALIKE
+
+
+def distance(a: Ground, b: Ground, numbers: slice = slice(None)) -> float:
+    """Mean square distance of two signatures in their spreads, over `numbers` that both have; infinite where
+    there are none.
+    """
+    both = np.zeros(len(SIGNATURE), dtype=bool)
+    both[numbers] = ((a.signature.count > 0.0) & (b.signature.count > 0.0))[numbers]
     if not both.any():
-        return False
+        return math.inf
     square = (a.signature.mean - b.signature.mean)[both] ** 2 / (a.variance() + b.variance())[both]
-    return float(square.mean()) < ALIKE
+    return float(square.mean())
 
 
 def nan_mean(rows: Sequence[Array]) -> Array:

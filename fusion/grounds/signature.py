@@ -27,6 +27,8 @@ SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide", "slip")
 """log10 of band RMS over the baseline at 1 m/s (vertical, horizontal, roll and pitch); 1 - yaw rate of the
 gyro over that of the wheels; acceleration of the body over that of the wheels; probability of slippery
 friction, and slip. Only fixes give the last two: they tell grounds apart that are learned."""
+FELT = slice(0, SIGNATURE.index("slide"))
+"""What the robot feels without fixes."""
 
 BANDS: tuple[AxesBand, ...] = (
     *((VERTICAL, band) for band in (LOW_HZ, MID_HZ, HIGH_HZ)),

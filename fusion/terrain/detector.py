@@ -85,11 +85,12 @@ class TerrainDetector:
             self._filter.update(evidence)
         return self.probabilities
 
-    def fuse(self, probabilities: ArrayLike) -> Array:
+    def fuse(self, probabilities: ArrayLike, share: float = 1.0) -> Array:
         """Class probabilities (k,) after an external source (a camera) gave its own (k,).
 
         They multiply in as evidence relative to equal probabilities, tempered by `EXTERNAL_TRUST` and the
-        source's `credit`, after a share `EXTERNAL_ERROR` of them is spread evenly.
+        source's `credit`, after a share `EXTERNAL_ERROR` of them is spread evenly. Frames that come faster
+        than windows have a `share` (0 to 1) of the evidence of one, as they see the same ground.
 
         Raises:
             DataError: not k finite, non-negative numbers with a positive sum.
@@ -104,7 +105,7 @@ class TerrainDetector:
             )
         self.credit.claim(q / q.sum())
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
-        self._filter.update(EXTERNAL_TRUST * self.credit.value * np.log(q))
+        self._filter.update(EXTERNAL_TRUST * share * self.credit.value * np.log(q))
         return self.probabilities
 
 

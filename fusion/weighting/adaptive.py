@@ -94,6 +94,7 @@ class TerrainNoise:
         self.window: Window | None = None
         self._last_speed = np.nan
         self._source = "detector"
+        self._external_ns: int | None = None
 
     def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
         """Take over the slip that the robot itself shows: mean and sigma for the ground that no class
@@ -207,7 +208,9 @@ class TerrainNoise:
                 remedy=f"the policy knows {', '.join(self.detector.classes)}",
             )
         given = [probabilities.get(name, 0.0) for name in self.detector.classes]
-        self.detector.fuse(as_numbers(given, "probabilities", "terrain"))
+        since_ns = UPDATE_NS if self._external_ns is None else abs(t_ns - self._external_ns)
+        self.detector.fuse(as_numbers(given, "probabilities", "terrain"), min(since_ns / UPDATE_NS, 1.0))
+        self._external_ns = t_ns
         self._source = "external source"
         self._reweight(t_ns)
 
@@ -226,7 +229,9 @@ class TerrainNoise:
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
-            self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
+            replaced = self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
+            if replaced is not None:
+                self._ground_slip.clear(replaced)
             self._ground_slip.recognise(self.grounds.memory.belief)
             self.found_ground = ""
             if int(self._probabilities.argmax()) == self._unknown:
@@ -249,8 +254,9 @@ class TerrainNoise:
             return
         if not window.ground_speed_mps() > MIN_SPEED_MPS:
             return
-        if self._starts_pooled:
-            self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s)
+        if self._starts_pooled and self.grounds is not None:
+            for place in self._ground_slip.learn(window.slip, window.slip_sigma, self._grade, window.dt_s):
+                self.grounds.memory.forget_slip(place)
         self._driven.add(self._shares, window.slip, window.slip_sigma, self._grade, window.dt_s)
         self._slips = self._driven.posterior()
 

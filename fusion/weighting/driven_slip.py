@@ -82,6 +82,11 @@ class DrivenSlip:
         self._count, self._square = self._count + count, self._square + count * (1.0 - gain) * off**2
         self._mean = self._mean + gain * off
 
+    def clear(self, ground: int) -> None:
+        """Forget what was seen of one ground."""
+        for tally in (self._driven_s, self._known, self._mean, self._count, self._square):
+            tally[ground] = 0.0
+
     def posterior(self) -> tuple[Array, Array]:
         """Mean and 1 sigma (k,) of the slip to expect on each ground."""
         prior, share, variance = self.prior, self.shares(), self._variance()

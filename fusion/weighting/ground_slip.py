@@ -74,14 +74,25 @@ class GroundSlip:
         self._belief[: len(belief)] = belief
         self._blend()
 
-    def learn(self, slip: float, sigma: float, grade: float, dt_s: float) -> None:
-        """Slip with its 1 sigma, as measured for `dt_s` on the ground that the robot is on."""
+    def learn(self, slip: float, sigma: float, grade: float, dt_s: float) -> list[int]:
+        """Slip with its 1 sigma, as measured for `dt_s` on the ground that the robot is on.
+
+        Returns:
+            places in the memory of grounds whose slip on earlier drives it contradicts.
+        """
         known = np.append(0.0, self._belief[1:])
         level = slip - self.per_grade * grade
         self._slip.add(known, level, sigma * math.sqrt(WINDOWS_PER_OBSERVATION), 0.0, dt_s)
         stale = [i for i in self._known if self._slip.contradicted(STALE)[i]]
         if stale:
             self._known = {i: ground for i, ground in self._known.items() if i not in stale}
+            self.expect(*self._whole)
+        return [i - 1 for i in stale]
+
+    def clear(self, place: int) -> None:
+        """Another ground has taken a place in the memory."""
+        self._slip.clear(1 + place)
+        if self._known.pop(1 + place, None) is not None:
             self.expect(*self._whole)
 
     def known(self) -> dict[int, tuple[float, float]]:

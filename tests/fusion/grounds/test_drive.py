@@ -86,6 +86,8 @@ def test_a_poisoned_memory_makes_the_estimate_no_worse(drive: Recording) -> None
     assert errors[0] is not None
     assert errors[1] is not None
     assert errors[1] < errors[0] + 0.1
+    assert poisoned.grounds is not None
+    assert abs(poisoned.grounds.grounds[0].motion.mean[0]) < 0.1
 
 
 def test_a_dump_goes_on_with_the_same_memory(drive: Recording) -> None:

@@ -21,9 +21,11 @@ from terrafusion.fusion.terrain.features import Window
 SMOOTH, ROUGH = 1.2, 2.0
 
 
-def signature(level: float, rng: np.random.Generator, yaw_slip: float = 0.4) -> np.ndarray:
+def signature(
+    level: float, rng: np.random.Generator, yaw_slip: float = 0.4, spread: float = 0.2
+) -> np.ndarray:
     out = np.full(len(SIGNATURE), np.nan)
-    out[: len(VIBRATION)] = level + 0.2 * rng.normal(size=len(VIBRATION))
+    out[: len(VIBRATION)] = level + spread * rng.normal(size=len(VIBRATION))
     out[SIGNATURE.index("yaw_slip")] = yaw_slip + 0.05 * rng.normal()
     return out
 
@@ -62,6 +64,36 @@ def test_one_ground_stays_one() -> None:
     memory, rng = GroundMemory(), np.random.default_rng(3)
     drive(memory, SMOOTH, rng, 400)
     assert len(memory.condensed()) == 1
+
+
+def test_a_ground_met_late_is_learned_beside_one_known_for_long() -> None:
+    """Its spread is not known yet; that of the first is small, which says nothing of the second."""
+    memory, rng = GroundMemory(), np.random.default_rng(7)
+    for level in (SMOOTH,) * 600 + (SMOOTH + 0.4,) * 100:
+        memory.recognise(signature(level, rng, spread=0.06), 0.5)
+        memory.learn("")
+    assert len(memory) == 2
+    assert memory.grounds[1].windows > 80
+
+
+def test_without_fixes_a_ground_is_that_of_today_where_an_earlier_one_felt_the_same() -> None:
+    """Tyres are changed overnight: the ground feels as before, and slips by .05, not by .3."""
+    rng, slip = np.random.default_rng(11), SIGNATURE.index("slip")
+
+    def driven(memory: GroundMemory, slipping: float, windows: int) -> None:
+        for _ in range(windows):
+            window = signature(SMOOTH, rng, spread=0.06)
+            window[slip] = slipping + 0.01 * rng.normal()
+            memory.recognise(window, 0.5)
+            memory.learn("")
+
+    monday = GroundMemory()
+    driven(monday, 0.3, 400)
+    tuesday = monday.condensed()
+    driven(tuesday, 0.05, 60)
+    for _ in range(40):
+        tuesday.recognise(signature(SMOOTH, rng, spread=0.06), 0.5)
+    assert tuesday.belief.argmax() == len(tuesday) == 2
 
 
 def test_a_ground_is_not_made_by_a_few_strange_windows() -> None:
@@ -174,6 +206,23 @@ def test_a_full_memory_counts_what_it_leaves_out() -> None:
         memory.learn("")
     assert len(memory) == MOST_GROUNDS
     assert memory.left_out > 40
+
+
+def test_a_new_ground_takes_the_place_of_one_that_is_too_short_to_be_kept() -> None:
+    """Changes of ground leave short ones behind, more of them the longer a drive lasts."""
+    rng, places, grounds = np.random.default_rng(12), list[int | None](), list[Ground]()
+    for i in range(MOST_GROUNDS):
+        ground = Ground.new(f"ground {i + 1}")
+        for _ in range(10 if i == 3 else 50):
+            ground = ground.seen(np.full(len(SIGNATURE), 4.0 + i), 1.0, "")
+        grounds.append(ground)
+    memory = GroundMemory(grounds)
+    for _ in range(60):
+        memory.recognise(signature(SMOOTH, rng), 0.5)
+        places.append(memory.learn(""))
+    assert {place for place in places if place is not None} == {3}
+    assert (len(memory), memory.left_out) == (MOST_GROUNDS, 0)
+    assert memory.grounds[3].windows > 40
 
 
 def test_many_grounds_of_several_robots_still_fit_into_a_file(tmp_path: Path) -> None:

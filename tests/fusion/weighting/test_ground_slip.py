@@ -51,6 +51,15 @@ def test_each_ground_has_its_own_slip_and_new_ground_that_of_the_drive() -> None
     assert (slip.mean, slip.sigma) == WHOLE[:2]
 
 
+def test_what_was_seen_of_a_ground_says_nothing_of_one_that_takes_its_place() -> None:
+    slip = driven({1: 0.0, 2: 0.2})
+    slip.clear(1)
+    slip.recognise(belief(2))
+    assert (slip.mean, slip.sigma) == WHOLE[:2]
+    slip.recognise(belief(1))
+    assert slip.mean == pytest.approx(0.0, abs=0.04)
+
+
 def test_the_slip_of_a_grade_is_no_slip_of_the_ground() -> None:
     slip = GroundSlip(*WHOLE)
     slip.recognise(belief(1))

@@ -148,6 +148,17 @@ def test_changes_of_the_noise_are_recorded_from_a_tenth_on_with_their_reason() -
     assert weights.take_changes() == []
 
 
+def test_a_fast_camera_counts_as_much_as_a_slow_one() -> None:
+    said = {"mud": 0.6, "loose_sand": 0.4}
+    after = []
+    for hz in (2, 30):
+        weights = noise_of("elevate")
+        for k in range(hz + 1):
+            weights.external(round(k / hz * 1e9), said)
+        after.append(list(weights.posterior().values()))
+    assert after[0] == pytest.approx(after[1], abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
