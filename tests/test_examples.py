@@ -1,4 +1,4 @@
-"""The scripts of docs/examples run as they stand, without a log of the reader's own."""
+"""The scripts of docs/examples run as they stand, without a log of the reader's own, on the first minute."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from tests.test_docs import cut_after
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 SAID = {
@@ -30,6 +32,7 @@ def test_example(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    cut_after(60.0, monkeypatch)
     monkeypatch.setattr(sys, "argv", [f"{name}.py"])
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert SAID[name] in capsys.readouterr().out

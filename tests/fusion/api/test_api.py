@@ -18,7 +18,7 @@ from terrafusion.fusion.benchmark.outage_plan import until
 
 @pytest.fixture(scope="module")
 def log() -> tf.Recording:
-    return tf.simulate("straight", terrain="grass", seed=1)
+    return until(tf.simulate("straight", terrain="grass", seed=1), 35.0)
 
 
 @pytest.fixture(scope="module")

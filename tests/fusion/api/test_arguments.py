@@ -200,7 +200,7 @@ def test_a_memory_of_grounds_is_of_one_robot(log: tf.Recording) -> None:
 
 def test_a_magnetometer_that_is_not_there_is_missed(log: tf.Recording) -> None:
     assert log.magnetometer is None
-    result = tf.replay(log, magnetometer=True)
+    result = tf.replay(until(log, 20.0), magnetometer=True)
     assert any("no magnetometer" in note for note in result.estimate.notes)
 
 

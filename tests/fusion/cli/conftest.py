@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.writers import write_log_folder
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.simulate import simulate
 
 LIMIT_S = 10.0
 """Of processor time: a machine that is busy with other things makes nothing slow."""
@@ -27,11 +33,17 @@ route:
 
 
 @pytest.fixture(scope="session")
+def chirp() -> Recording:
+    """Changes of speed, then of the yaw rate, on asphalt; 52 s."""
+    whole = load_scenario("chirp")
+    shorter = tuple(dataclasses.replace(s, duration_s=min(s.duration_s, 21.0)) for s in whole.drive)
+    scenario = dataclasses.replace(whole, drive=shorter, duration_s=sum(s.duration_s for s in shorter))
+    return simulate(scenario, terrain="asphalt", seed=3)
+
+
+@pytest.fixture(scope="session")
 def good_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log folder that replays well."""
-    from terrafusion.datasets.writers import write_log_folder
-    from terrafusion.twin.simulate import simulate
-
     folder = tmp_path_factory.mktemp("good")
     (folder / "short.yaml").write_text(SCENARIO)
     return write_log_folder(simulate(str(folder / "short.yaml"), seed=1), folder / "log")

@@ -21,7 +21,6 @@ from terrafusion.datasets.readers.ros import streams
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.simulate import simulate
 from tests.datasets.ros_bags import MAKE2, Message, write_ros2
 
 HUSKY = ("-z", "-x", "+y")
@@ -40,10 +39,9 @@ def file_of(path: Path) -> dict[str, dict[str, object]]:
 
 
 @pytest.fixture(scope="module")
-def drive() -> Recording:
+def drive(chirp: Recording) -> Recording:
     """A drive of the nominal platform with changes of speed, under a name that nobody knows."""
-    found = simulate("chirp", terrain="asphalt", seed=3)
-    return dataclasses.replace(found, vehicle="rover_9", truth=None)
+    return dataclasses.replace(chirp, vehicle="rover_9", truth=None)
 
 
 def sensor_frame(recording: Recording, axes: tuple[str, ...]) -> Recording:

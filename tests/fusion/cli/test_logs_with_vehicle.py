@@ -8,13 +8,13 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner, Result
 
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.sensor_calibration import calibrate_sensors
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.simulate import simulate
 
 OWN = """robot:
   extends: base.yaml
@@ -32,12 +32,11 @@ def run(*words: str | Path) -> Result:
 
 
 @pytest.fixture
-def workshop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workshop(chirp: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a log of an unnamed robot and its vehicle file, which extends another one."""
     place = tmp_path / "workshop"
     place.mkdir()
-    found = simulate("chirp", terrain="asphalt", seed=3)
-    write_log_folder(dataclasses.replace(found, vehicle=None, truth=None), place / "drive")
+    write_log_folder(dataclasses.replace(chirp, vehicle=None, truth=None), place / "drive")
     (place / "own.yaml").write_text(OWN)
     (place / "base.yaml").write_text(BASE)
     monkeypatch.chdir(place)

@@ -47,6 +47,7 @@ def test_a_folder_of_odd_name_is_replayed(name: str, good_log: Path, tmp_path: P
     assert ESC not in done.refused("no such file", "\\x1b[31m")
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("name", ["sh\\eort\\e[31m", "sh\\uD800ort"])
 def test_a_name_in_meta_is_printed_with_escapes(
     name: str, good_log: Path, tmp_path: Path, terrafusion

@@ -392,16 +392,16 @@ def with_wheels(recording: Recording, more_mps: np.ndarray) -> Recording:
 
 
 @pytest.mark.parametrize("mode", ["adaptive", "fixed", "robust", "innovation"])
-@pytest.mark.parametrize(("jump_m", "at_s"), [(0.1, 20.0), (0.2, 20.02), (-0.5, 20.05), (5.0, 20.0)])
-def test_a_counter_of_the_wheels_that_jumps_once_moves_the_pose_by_less_than_2_cm(
-    drive: Recording, mode: str, jump_m: float, at_s: float
+def test_a_counter_of_the_wheels_that_jumps_moves_the_pose_by_less_than_2_cm(
+    drive: Recording, mode: str
 ) -> None:
     """Wherever in a keyframe or between two it falls."""
     assert drive.wheels is not None
     t_ns = drive.wheels.t_ns
-    k = int(np.searchsorted(t_ns, drive.start_ns + round(at_s * 1e9)))
     more_mps = np.zeros(len(t_ns))
-    more_mps[k] = jump_m / (float(t_ns[k] - t_ns[k - 1]) * 1e-9)
+    for jump_m, at_s in ((0.1, 12.0), (0.2, 16.02), (-0.5, 20.05), (5.0, 24.0)):
+        k = int(np.searchsorted(t_ns, drive.start_ns + round(at_s * 1e9)))
+        more_mps[k] = jump_m / (float(t_ns[k] - t_ns[k - 1]) * 1e-9)
     spoilt = feed(with_wheels(drive, more_mps), messages(drive), mode)
     pairs = zip(plainly_driven(mode).states, spoilt.states, strict=True)
     assert max(np.linalg.norm(a.position_m - b.position_m) for a, b in pairs) < 0.02

@@ -320,6 +320,7 @@ def test_yaw_noise_by_source(rate_radps: float) -> None:
     assert none.yaw_density(0.0, 1.0) > wheels.yaw_density(0.0, 1.0)
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("what", [*REDUCED, "gyro z and body speed"])
 def test_the_command_on_a_reduced_log_folder(exact: Recording, tmp_path: Path, what: str) -> None:
     from typer.testing import CliRunner

@@ -128,7 +128,7 @@ def test_diagnostics_carry_the_states(drive: Any) -> None:
     assert float(told.values["icr_x_m"]) == pytest.approx(0.05)
 
 
-def test_the_command_calibrates_on_demand(tmp_path: Path) -> None:
+def test_the_command_calibrates_on_demand(tmp_path: Path, no_report: None) -> None:
     turning = Scenario(
         "turning",
         20.0,

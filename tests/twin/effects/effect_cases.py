@@ -41,10 +41,18 @@ def vector(values: dict[str, float]) -> np.ndarray:
     return np.array([values.get(key, 0.0) for key in KEYS])
 
 
+@functools.cache
+def soil_of(terrain: str) -> np.ndarray:
+    """The soil's numbers, read once."""
+    numbers = soil_vector(load_soil(terrain))
+    numbers.setflags(write=False)
+    return numbers
+
+
 def plant(
     terrain: str = "loose_sand", effects: dict[str, float] | None = None, slope_rad: float = 0.0
 ) -> Plant:
-    route = RouteTable("travel", np.zeros(1), soil_vector(load_soil(terrain))[None])
+    route = RouteTable("travel", np.zeros(1), soil_of(terrain)[None])
     vehicle = vehicle_vector(ELEVATE, slope_rad=slope_rad)
     late = (effects or {}).get("dead_time/transport", 0.0)
     vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += late
@@ -52,7 +60,7 @@ def plant(
 
 
 def soil(terrain: str = "loose_sand") -> np.ndarray:
-    return np.tile(soil_vector(load_soil(terrain)), 4)
+    return np.tile(soil_of(terrain), 4)
 
 
 @functools.cache
