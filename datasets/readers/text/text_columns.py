@@ -30,9 +30,9 @@ from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
+"""Rows that tell a decimal comma."""
 PREFACE_LINES = 60
 """So many lines may stand in front of a header."""
-"""Rows that tell a decimal comma."""
 _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 """What may stand in front of a header for Excel."""
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
