@@ -55,7 +55,8 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
     if contents.unused:
         print_lines(entry("not used", "dim", ", ".join(contents.unused)))
     chosen = dict(topics)
-    for kind, names in contents.candidates.items():
+    while contents is not None and contents.candidates:
+        kind, names = next(iter(contents.candidates.items()))
         rates = [f"{name} ({clocks[name]['rate_hz'] or 0.0:.3g} Hz)" for name in names]
         if not interactive():
             raise DataError(
@@ -68,6 +69,7 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
         for number, shown in enumerate(rates, 1):
             print(f"  {number}  {shown}")
         chosen[kind] = names[_number_to(len(names)) - 1]
+        contents = bag_contents(log, chosen)  # of several robots the wheels choose the other topics
     return chosen
 
 

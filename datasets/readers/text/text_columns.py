@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import (
     BLANKS,
@@ -48,8 +49,9 @@ class TextColumns:
     def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
         text = read_text(path, any_encoding=True)
-        self._layout = _layout(text, column_map)
-        self._preface = max(_below_preface(text) - 1, 0)
+        headed = column_map is None or column_map.header != "none"
+        self._preface = _preface(text) if headed else 0
+        self._layout = _layout(text, column_map, self._preface)
         text, self._repeated = _headed_once(text, self._layout)
         self.units, row = _units_below(text, self._layout)
         self._layout = dataclasses.replace(self._layout, first_line=row)
@@ -65,7 +67,9 @@ class TextColumns:
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
         self.notes += [again] if self._repeated else []
-        self.notes += [f"{self._preface} lines in front of the header are left out"] if self._preface else []
+        self.notes += (
+            [f"{counted(self._preface, 'line')} in front of the header left out"] if self._preface else []
+        )
         self.notes += ["the line below the header holds units; left out"] if self.units else []
 
     def first_cells(self) -> list[str]:
@@ -101,13 +105,12 @@ def numbered(count: int) -> list[str]:
     return [str(i) for i in range(1, count + 1)]
 
 
-def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
-    """Names from the first line that is no comment, or from the comment before a first line of numbers;
-    without a map, a first line of numbers is a row."""
+def _layout(data: bytes, column_map: ColumnMap | None, preface: int) -> TextLayout:
+    """Names from the first line below the preface that is no comment, or from the comment before a first line
+    of numbers; without a map, a first line of numbers is a row."""
     comment, header, number = "", "", 0
-    begin = _below_preface(data)
     for at, line in head_lines(data):
-        if at < begin:
+        if at <= preface:
             continue
         if line.startswith(COMMENT):
             comment = line.lstrip("# ")
@@ -130,10 +133,10 @@ def _layout(data: bytes, column_map: ColumnMap | None) -> TextLayout:
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 
-def _below_preface(data: bytes) -> int:
-    """The line of names, from 1, where lines of other lengths stand in front of it; else 0.
+def _preface(data: bytes) -> int:
+    """Number of lines in front of the line of names, where they are of other lengths; else 0.
 
-    It is the first of those that are as long as the first two rows of numbers, right above them.
+    The names are the first of the lines as long as the first two rows of numbers, right above these.
     """
     lines = [
         (at, line) for at, line in head_lines(data, PREFACE_LINES) if line.strip() and line[0] != COMMENT
@@ -147,7 +150,7 @@ def _below_preface(data: bytes) -> int:
     first = top = next(rows, 0)
     while top and len(cells[top - 1]) == len(cells[first]):
         top -= 1
-    return lines[top][0] if 0 < top < first else 0
+    return lines[top][0] - 1 if 0 < top < first else 0
 
 
 def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:

@@ -19,9 +19,10 @@ from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros import streams
 from terrafusion.datasets.writers import write_log_folder
+from terrafusion.fusion.cli import init_page
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.datasets.ros_bags import MAKE2, Message, write_ros2
+from tests.datasets.ros_bags import MAKE2, Message, imu_messages, odometry_messages, write_ros2
 
 HUSKY = ("-z", "-x", "+y")
 RADIUS_M = 0.175
@@ -246,3 +247,15 @@ def test_the_user_is_asked_on_a_terminal(bag: Path, tmp_path: Path, monkeypatch:
     assert (robot["drive"], robot["track_m"]) == ("tracked", {"value": 0.51, "known": "data_sheet"})
     assert robot["mass_kg"] == {"value": 40.0, "known": "assumed"}
     assert "verdict" not in done.output
+
+
+def test_the_wheels_of_one_robot_choose_its_other_topics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two robots the first has two IMUs, which are no matter of the second."""
+    messages = [m for end in ("front", "rear") for m in imu_messages(MAKE2, f"/a/{end}/imu")]
+    messages += imu_messages(MAKE2, "/b/imu") + odometry_messages(MAKE2, "/a/odom")
+    path = write_ros2(tmp_path / "two", messages + odometry_messages(MAKE2, "/b/odom"))
+    monkeypatch.setattr(init_page, "interactive", lambda: True)
+    monkeypatch.setattr("typer.prompt", lambda *_, **__: 2)
+    assert init_page.choose_sensors(str(path), {}) == {"wheels": "/b/odom"}
