@@ -164,7 +164,7 @@ def _of_one_robot(
     """The bag without topics of other robots than that of the wheels; chooses the wheels where they are open.
 
     A namespace with wheels and another sensor is a robot's, and so are those named alike but for a number or
-    a letter (husky_1, husky_2) that hold both together and share a sensor: boards of one robot share none.
+    a letter (husky_1, husky_2) that hold both together.
     """
     sensors = [(t, kind) for t in bag for kind in SENSORS if t.msgtype in TYPES[kind]]
     paths = [t.name.split("/") for t, _ in sensors]
@@ -177,8 +177,7 @@ def _of_one_robot(
     robots = [space for space, kinds in spaces.items() if _makes_a_robot(kinds)]
     for space in spaces:
         alike = [other for other in spaces if _ROBOT.sub("", other) == _ROBOT.sub("", space)]
-        held = [kind for one in alike for kind in spaces[one]]
-        if len(robots) < 2 and len(held) > len(set(held)) and _makes_a_robot(held):
+        if len(robots) < 2 <= len(alike) and _makes_a_robot(kind for one in alike for kind in spaces[one]):
             robots = alike
     if len(robots) < 2:
         return bag
