@@ -57,6 +57,7 @@ class GroundMemory:
         self._waiting: list[Array] = []
         self.left_out = 0
         self._today = [0.0] * len(self.grounds)  # windows of this drive, with fixes
+        self._earlier = len(self.grounds)
 
     def __repr__(self) -> str:
         """A line a ground."""
@@ -127,15 +128,23 @@ class GroundMemory:
         middle = np.where(np.isfinite(signature), nearest.signature.mean, np.nan)
         return np.append(nearest.log_likelihood(middle, wider) - NOVEL, found)
 
-    def _changed(self) -> list[int]:
+    def contradicted(self) -> bool:
+        """Whether a ground that is new in this drive feels like one of an earlier drive: its slip changed."""
+        new = range(self._earlier, len(self))
+        return any(place < self._earlier for place in self._changed(new))
+
+    def _changed(self, by: Iterable[int] | None = None) -> list[int]:
         """Places of grounds that feel like one that this drive has shown, and that it has not shown: tyres or
         weather may have changed since they slipped otherwise, and without fixes today's slip is expected.
+
+        `by`: places of the ones shown that count, all where None.
         """
         shown = [i for i, windows in enumerate(self._today) if windows >= LEAST_WINDOWS]
+        among = shown if by is None else [i for i in by if i in shown]
         return [
             i
             for i, ground in enumerate(self.grounds)
-            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in shown)
+            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in among)
         ]
 
     def learn(self, date: str, friction: Array | None = None) -> int | None:

@@ -90,7 +90,11 @@ def test_without_fixes_a_ground_is_that_of_today_where_an_earlier_one_felt_the_s
     monday = GroundMemory()
     driven(monday, 0.3, 400)
     tuesday = monday.condensed()
+    driven(tuesday, 0.3, 40)
+    assert not tuesday.contradicted()
+    tuesday = tuesday.condensed()
     driven(tuesday, 0.05, 60)
+    assert tuesday.contradicted()
     for _ in range(40):
         tuesday.recognise(signature(SMOOTH, rng, spread=0.06), 0.5)
     assert tuesday.belief.argmax() == len(tuesday) == 2
