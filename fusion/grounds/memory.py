@@ -15,7 +15,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.printable import counted
-from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
+from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground, is_given
 from terrafusion.fusion.grounds.signature import FELT, SIGNATURE
 
 PATCH_M = 25.0
@@ -238,7 +238,7 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
                     grounds[same] = dataclasses.replace(ground, name=grounds[same].name)
                 continue
             name, i = ground.name, 1
-            while name in names and name.startswith("ground "):
+            while name in names and not is_given(name):
                 name, i = f"ground {i}", i + 1
             names.add(name)
             grounds.append(dataclasses.replace(ground, name=name))
@@ -247,7 +247,7 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
 
 def alike(a: Ground, b: Ground) -> bool:
     """Whether two signatures are those of one ground; two that were named differently never are."""
-    named = [g.name for g in (a, b) if not g.name.startswith("ground ")]
+    named = [g.name for g in (a, b) if is_given(g.name)]
     if len(set(named)) == 2:
         return False
     return distance(a, b) < ALIKE
