@@ -1,6 +1,7 @@
 """One ground as one robot knows it: its signature, and what it does to wheels, heading and path."""
 
 import dataclasses
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,10 +142,10 @@ class Ground:
         """This ground with what `other` knows of the same one."""
         windows = self.friction_windows + other.friction_windows
         share = other.friction_windows / windows if windows else 0.0
-        named = self.name if not self.name.startswith("ground ") else other.name
+        named = self.name if is_given(self.name) else other.name
         dates = [d for d in (self.first, other.first, self.last, other.last) if d]
         return Ground(
-            named if not named.startswith("ground ") else self.name,
+            named if is_given(named) else self.name,
             self.signature.merged(other.signature),
             self.motion.merged(other.motion),
             (1.0 - share) * self.friction + share * other.friction,
@@ -153,6 +154,11 @@ class Ground:
             max(dates, default=""),
             self.origin or other.origin,
         )
+
+
+def is_given(name: str) -> bool:
+    """Whether a user gave a name: a ground that was found is "ground" and a number."""
+    return re.fullmatch(r"ground \d+", name) is None
 
 
 def student_t(values: Array, mean: Array, variance: Array, known: NDArray[np.bool_]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.printable import counted
-from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
+from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground, is_given
 from terrafusion.fusion.grounds.signature import FELT, SIGNATURE
 
 PATCH_M = 25.0
@@ -57,6 +57,7 @@ class GroundMemory:
         self._waiting: list[Array] = []
         self.left_out = 0
         self._today = [0.0] * len(self.grounds)  # windows of this drive, with fixes
+        self._earlier = len(self.grounds)
 
     def __repr__(self) -> str:
         """A line a ground."""
@@ -127,15 +128,23 @@ class GroundMemory:
         middle = np.where(np.isfinite(signature), nearest.signature.mean, np.nan)
         return np.append(nearest.log_likelihood(middle, wider) - NOVEL, found)
 
-    def _changed(self) -> list[int]:
+    def contradicted(self) -> bool:
+        """Whether a ground that is new in this drive feels like one of an earlier drive: its slip changed."""
+        new = range(self._earlier, len(self))
+        return any(place < self._earlier for place in self._changed(new))
+
+    def _changed(self, by: Iterable[int] | None = None) -> list[int]:
         """Places of grounds that feel like one that this drive has shown, and that it has not shown: tyres or
         weather may have changed since they slipped otherwise, and without fixes today's slip is expected.
+
+        `by`: places of the ones shown that count, all where None.
         """
         shown = [i for i, windows in enumerate(self._today) if windows >= LEAST_WINDOWS]
+        among = shown if by is None else [i for i in by if i in shown]
         return [
             i
             for i, ground in enumerate(self.grounds)
-            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in shown)
+            if i not in shown and any(distance(ground, self.grounds[j], FELT) < ALIKE for j in among)
         ]
 
     def learn(self, date: str, friction: Array | None = None) -> int | None:
@@ -229,7 +238,7 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
                     grounds[same] = dataclasses.replace(ground, name=grounds[same].name)
                 continue
             name, i = ground.name, 1
-            while name in names and name.startswith("ground "):
+            while name in names and not is_given(name):
                 name, i = f"ground {i}", i + 1
             names.add(name)
             grounds.append(dataclasses.replace(ground, name=name))
@@ -238,7 +247,7 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
 
 def alike(a: Ground, b: Ground) -> bool:
     """Whether two signatures are those of one ground; two that were named differently never are."""
-    named = [g.name for g in (a, b) if not g.name.startswith("ground ")]
+    named = [g.name for g in (a, b) if is_given(g.name)]
     if len(set(named)) == 2:
         return False
     return distance(a, b) < ALIKE

@@ -26,7 +26,7 @@ BETWEEN_DRIVES = 0.03
 CLEAR = 0.5
 """Share of what a drive has shown in the slip that is expected, from which that is the ground's own."""
 STALE = 3.0
-"""Sigmas by which the slip of the drive contradicts that of earlier ones, which is then forgotten."""
+"""Sigmas by which the slip of the drive on a ground contradicts the memory, which then is not believed."""
 
 
 class GroundSlip:
@@ -85,9 +85,14 @@ class GroundSlip:
         self._slip.add(known, level, sigma * math.sqrt(WINDOWS_PER_OBSERVATION), 0.0, dt_s)
         stale = [i for i in self._known if self._slip.contradicted(STALE)[i]]
         if stale:
-            self._known = {i: ground for i, ground in self._known.items() if i not in stale}
-            self.expect(*self._whole)
+            self.distrust()
         return [i - 1 for i in stale]
+
+    def distrust(self) -> None:
+        """Expect no slip of earlier drives: other tyres change that of every ground."""
+        if self._known:
+            self._known = {}
+            self.expect(*self._whole)
 
     def clear(self, place: int) -> None:
         """Another ground has taken a place in the memory."""

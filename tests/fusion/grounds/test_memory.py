@@ -90,7 +90,11 @@ def test_without_fixes_a_ground_is_that_of_today_where_an_earlier_one_felt_the_s
     monday = GroundMemory()
     driven(monday, 0.3, 400)
     tuesday = monday.condensed()
+    driven(tuesday, 0.3, 40)
+    assert not tuesday.contradicted()
+    tuesday = tuesday.condensed()
     driven(tuesday, 0.05, 60)
+    assert tuesday.contradicted()
     for _ in range(40):
         tuesday.recognise(signature(SMOOTH, rng, spread=0.06), 0.5)
     assert tuesday.belief.argmax() == len(tuesday) == 2
@@ -242,9 +246,9 @@ def test_many_grounds_of_several_robots_still_fit_into_a_file(tmp_path: Path) ->
 
 
 def test_a_name_given_by_the_user_stays_and_two_of_one_name_become_one() -> None:
-    memory = two_grounds().named({"ground 1": "lawn", "ground 2": "gravel"})
-    assert {g.name for g in merged([memory, two_grounds(1)]).grounds} == {"lawn", "gravel"}
-    assert len(memory.named({"lawn": "gravel"})) == 1
+    memory = two_grounds().named({"ground 1": "lawn", "ground 2": "ground of stones"})
+    assert {g.name for g in merged([two_grounds(1), memory]).grounds} == {"lawn", "ground of stones"}
+    assert len(memory.named({"lawn": "ground of stones"})) == 1
 
 
 def test_a_file_gives_the_same_memory_and_holds_no_position(tmp_path: Path) -> None:

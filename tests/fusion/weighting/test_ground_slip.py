@@ -102,12 +102,15 @@ def test_a_ground_of_an_earlier_drive_is_known_from_the_start() -> None:
 
 
 def test_a_memory_that_the_drive_contradicts_is_forgotten() -> None:
-    slip = GroundSlip(*WHOLE, known=[remembered(0.6)])
+    """On the ground that was driven, and where other tyres would show, too."""
+    slip = GroundSlip(*WHOLE, known=[remembered(0.6), remembered(0.5)])
     slip.recognise(belief(1))
     for _ in range(60):
         slip.learn(0.02, 0.02, 0.0, 0.5)
     slip.recognise(belief(1))
     assert slip.mean == pytest.approx(0.02, abs=0.03)
+    slip.recognise(belief(2))
+    assert (slip.mean, slip.sigma) == WHOLE[:2]
 
 
 def test_grounds_that_slip_alike_are_named_together() -> None:
