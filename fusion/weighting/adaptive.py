@@ -232,7 +232,7 @@ class TerrainNoise:
             replaced = self.grounds.update(self._on_the_level(window), state, rolled_m, friction)
             if replaced is not None:
                 self._ground_slip.clear(replaced)
-            if self.grounds.memory.contradicted():
+            if self._ground_slip.remembers and self.grounds.memory.contradicted():
                 self._ground_slip.distrust()
             self._ground_slip.recognise(self.grounds.memory.belief)
             self.found_ground = ""

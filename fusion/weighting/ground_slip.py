@@ -88,11 +88,15 @@ class GroundSlip:
             self.distrust()
         return [i - 1 for i in stale]
 
+    @property
+    def remembers(self) -> bool:
+        """Whether slip of earlier drives is expected."""
+        return bool(self._known)
+
     def distrust(self) -> None:
         """Expect no slip of earlier drives: other tyres change that of every ground."""
-        if self._known:
-            self._known = {}
-            self.expect(*self._whole)
+        self._known = {}
+        self.expect(*self._whole)
 
     def clear(self, place: int) -> None:
         """Another ground has taken a place in the memory."""
