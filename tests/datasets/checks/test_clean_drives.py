@@ -117,7 +117,7 @@ def test_a_robot_that_circles_fast_is_clean(stands_s: float) -> None:
 
 @pytest.mark.parametrize(("down", "height_m"), [(-1.0, 3.0), (1.0, 3.0), (-1.0, 0.0)])
 def test_upward_velocities_of_a_receiver_that_counts_down(down: float, height_m: float) -> None:
-    good = lively_drive()
+    good = lively_drive(seconds=90.0)
     assert good.gnss is not None
     assert good.gnss.velocity_enu_mps is not None
     t = (good.gnss.t_ns - START_NS) * 1e-9

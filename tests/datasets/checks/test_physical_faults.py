@@ -19,17 +19,17 @@ from terrafusion.datasets.core.trajectory import Trajectory
 pytestmark = pytest.mark.usefixtures("checked_once")
 
 START_NS = 1_700_000_000_000_000_000
-SECONDS, REST_S = 90.0, 6.0
+SECONDS, REST_S = 64.0, 6.0
 RADIUS_M, TRACK_M, EFFECTIVE_TRACK_M = 0.1651, 0.555, 0.9
 DATUM = (48.1, 11.5, 520.0)
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 Fault = Callable[[Recording], Recording]
 
 
-def lively_drive(seed: int = 0, speed_mps: float = 1.0) -> Recording:
+def lively_drive(seed: int = 0, speed_mps: float = 1.0, seconds: float = SECONDS) -> Recording:
     """A rest, then a winding drive whose IMU feels what the wheels do; clean but for noise."""
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, SECONDS, 0.002)
+    t = np.arange(0.0, seconds, 0.002)
     going = np.clip((t - REST_S) / 2.0, 0.0, 1.0)
     v = speed_mps * going * (1.0 + 0.4 * np.sin(0.7 * t) + 0.2 * np.sin(0.23 * t))
     rate = going * (0.35 * np.sin(0.31 * t) + 0.2 * np.sin(0.83 * t))
@@ -210,7 +210,7 @@ def tilted(r: Recording) -> Recording:
 def other_gyro(r: Recording) -> Recording:
     """Gyro z of a run that turned otherwise; no other channel shows turns."""
     rng = np.random.default_rng(3)
-    steps = np.repeat(rng.normal(0.0, 0.3, 46), 100)[:4500]
+    steps = np.repeat(rng.normal(0.0, 0.3, 46), 100)[: round(50 * SECONDS)]
     bare = without(r, "gnss", "truth", "command")
     return imu_with(gyro_radps=lambda g: np.stack([g[:, 0], g[:, 1], steps], axis=1))(bare)
 

@@ -16,12 +16,12 @@ from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.fusion.live.bag_player import messages_of
 
-VEHICLE, SECONDS = "elevate", 15.0
+VEHICLE, SECONDS = "elevate", 11.0
 
 
 @pytest.fixture(scope="session")
 def live_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """15 s of a drive on grass: Imu, JointState, NavSatFix, velocities, commands, `/tf_static`, `/datum`."""
+    """11 s of a drive on grass: Imu, JointState, NavSatFix, velocities, commands, `/tf_static`, `/datum`."""
     drive = simulate("figure_eight", terrain="grass", seed=5)
     end_ns = drive.start_ns + round(SECONDS * 1e9)
     parts = {name: channel.between(drive.start_ns, end_ns) for name, channel in drive.channels().items()}

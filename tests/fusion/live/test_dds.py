@@ -61,7 +61,7 @@ def serve_while(players: list[list[str]], bag: Path, domain: int, reliable: bool
     return run
 
 
-@pytest.mark.parametrize(("speed", "seconds"), [("5", "15"), ("1", "6")])
+@pytest.mark.parametrize(("speed", "seconds"), [("5", "11"), ("1", "6")])
 def test_a_run_without_loss_gives_the_bits_of_replay(
     speed: str, seconds: str, live_bag: Path, domain: int, replayed: Estimate
 ) -> None:
@@ -81,8 +81,8 @@ def test_loss_and_bad_messages_cost_little(live_bag: Path, domain: int, live_rec
 def test_a_publisher_that_dies_and_comes_back(live_bag: Path, domain: int) -> None:
     """It goes on three seconds later, and then begins from the start of the bag."""
     players = [
-        ["--speed", "5", "--end", "7"],
-        ["--speed", "5", "--begin", "10"],
+        ["--speed", "5", "--end", "5"],
+        ["--speed", "5", "--begin", "8"],
         ["--speed", "5", "--end", "6"],
     ]
     run = serve_while(players, live_bag, domain, reliable=False)
@@ -99,7 +99,7 @@ def test_the_command_runs_beside_a_robot(live_bag: Path, domain: int) -> None:
 
     from terrafusion.fusion.live.dds import _struct
 
-    player = played(live_bag, domain, "--speed", "2")
+    player = played(live_bag, domain, "--speed", "1.5")
     code = "from terrafusion.fusion.cli.main import main; main()"
     options = ["--vehicle", VEHICLE, "--loopback", "--domain", str(domain), "--seconds", "11"]
     command = subprocess.Popen(

@@ -55,7 +55,7 @@ def test_the_order_of_arrival_does_not_matter(messages: list[BagMessage], replay
 def test_a_late_joiner_estimates_the_rest_as_replay_does(
     messages: list[BagMessage], live_recording: Recording
 ) -> None:
-    begin = messages[0][0] + 4_000_000_000
+    begin = messages[0][0] + 3_000_000_000
     parts = {n: c.between(begin, begin + 10**11) for n, c in live_recording.channels().items()}
     rest = replay(dataclasses.replace(live_recording, **parts), vehicle=VEHICLE).estimate
     late = [one for one in messages if one[0] >= begin or one[1] in ("/datum", "/tf_static")]
@@ -66,7 +66,7 @@ def test_odometry_and_transforms_belong_together(run: Run) -> None:
     """map -> odom times odom -> base_link is the pose in map; rosbags reads all of it."""
     in_odom, in_map = run.decoded("/odometry"), run.decoded("/odometry/map")
     corrections, motions = run.decoded("/tf")[0::2], run.decoded("/tf")[1::2]
-    assert len(in_odom) == len(in_map) == len(corrections) == len(motions) > 1000
+    assert len(in_odom) == len(in_map) == len(corrections) == len(motions) > 700
     for o, m, c, b in list(zip(in_odom, in_map, corrections, motions, strict=True))[::97]:
         assert (o.header.frame_id, o.child_frame_id) == ("odom", "base_link")
         assert (m.header.frame_id, m.child_frame_id) == ("map", "base_link")
@@ -104,7 +104,7 @@ def test_diagnostics_name_the_status_and_count_what_came(run: Run) -> None:
     assert found["terrafusion/localisation"]["status"] == "running"
     assert float(found["terrafusion/localisation"]["status_s"]) > 5.0
     assert found["terrafusion/input"]["refused"] == "0"
-    assert int(found["terrafusion/input"]["received"]) > 3000
+    assert int(found["terrafusion/input"]["received"]) > 2500
     first = run.decoded("/diagnostics")[0]
     assert first.status[0].values[0].value == "waiting"
 
