@@ -8,7 +8,6 @@ from pathlib import Path
 from terrafusion.datasets.checks import Finding, run_checks
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
-from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.assumptions import Assumption, assumptions
@@ -110,11 +109,6 @@ def replay(
     """
     wheels_of(recording)  # refused before a vehicle is asked for
     params, vehicle_notes = choose_vehicle(recording, vehicle)
-    if grounds is not None and grounds.robot not in ("", params.name):
-        raise ConfigError(
-            f"the memory of grounds is that of '{grounds.robot}', the robot here is '{params.name}'",
-            remedy="keep one memory a robot, or give the vehicle by that name",
-        )
     used, held_out = split_fixes(recording, outages)
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = sensor_config_of(recording, used)
@@ -141,13 +135,10 @@ def replay(
         recording, estimate, estimator, config.rig, used, held_out, outages, findings,
         frozenset(one.name for one in assumed),
     )  # fmt: skip
-    learned_grounds = estimator.weights.learned_grounds()
-    if learned_grounds is not None and not learned_grounds.robot:
-        learned_grounds.robot = params.name
     return ReplayResult(
         recording, params, mode, config.policy, estimate, scores, used, held_out, outages, seconds,
         latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, alone, verdict, assumed,
-        estimator.learned.table(), learned_grounds, estimator.weights.found_shares(),
+        estimator.learned.table(), estimator.weights.learned_grounds(), estimator.weights.found_shares(),
     )  # fmt: skip
 
 

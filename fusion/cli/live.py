@@ -43,6 +43,7 @@ def live(
     seconds: float | None = None,
     foxglove: int | None = None,
     terrain_model: Path | None = None,
+    grounds: Path | None = None,
 ) -> Result:
     """Run the estimator beside a ROS 2 robot, without ROS: it speaks DDS itself.
 
@@ -70,6 +71,7 @@ def live(
         seconds: Stop after so long; else Ctrl-C.
         foxglove (PORT): Show it in Foxglove at ws://localhost:PORT.
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
+        grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, written at the end.
     """
     from terrafusion.fusion.live.node import LiveOptions
     from terrafusion.fusion.terrain.classifier import load_terrain_model
@@ -78,7 +80,7 @@ def live(
     options = LiveOptions(
         vehicle, mode, common.parse_topics(topic), stamps, frequency=rate, datum=origin,
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
-        terrain_model=None if terrain_model is None else load_terrain_model(terrain_model),
+        terrain_model=None if terrain_model is None else load_terrain_model(terrain_model), grounds=grounds,
     )  # fmt: skip
     of_a_robot = {
         "--domain": domain is not None, "--loopback": loopback, "--reliable": reliable,
@@ -154,6 +156,7 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     """A recording message by message, odometry after every IMU sample."""
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.estimator.history import History
+    from terrafusion.fusion.grounds.file import read_grounds, save_grounds
     from terrafusion.fusion.live.loop import live_estimator, run, verdict_of
 
     recording = open_recording(
@@ -167,14 +170,18 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
 
     with errors_of(log):
         history = History()
+        memory = None if options.grounds is None else read_grounds(options.grounds)
         estimator = live_estimator(
-            recording, options.vehicle, history, options.mode, False, options.terrain_model
+            recording, options.vehicle, history, options.mode, False, options.terrain_model, memory
         )
         taken = run(estimator, recording.messages(), publish, realtime)
         if not newest:
             raise DataError("the estimator never started", remedy="see `terrafusion inspect`")
         for line in taken.lines():
             print(line)
+    learned = estimator.weights.learned_grounds()
+    if options.grounds is not None and learned is not None:
+        save_grounds(learned, options.grounds)
     state = newest[0]
     print(f"{state.status}: {state.position_m.round(2).tolist()} m, slip {state.slip:.2f}")
     for line in verdict_of(estimator, history, recording).lines():

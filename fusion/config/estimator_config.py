@@ -140,6 +140,12 @@ class EstimatorConfig:
                     remedy="train one on its own logs with `terrafusion terrain train`",
                 )
             object.__setattr__(self, "policy", self.policy.with_grounds(model.classes))
+        if self.grounds is not None and self.grounds.robot not in ("", self.vehicle or ""):
+            raise ConfigError(
+                f"the memory of grounds is that of '{self.grounds.robot}', "
+                f"the robot here is '{self.vehicle}'",
+                remedy="keep one memory a robot, or give the vehicle by that name",
+            )
         for what, value, known in (
             ("mode", self.mode, MODES),
             ("robust_loss", self.robust_loss, ROBUST_LOSSES),

@@ -16,6 +16,7 @@ from terrafusion.fusion.config.sensor_config import imu_kind, sensor_config_of
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.verdict import Verdict
 from terrafusion.fusion.replay import judged
 from terrafusion.fusion.terrain.classifier import TerrainModel
@@ -46,6 +47,7 @@ def live_estimator(
     mode: str = "adaptive",
     gnss: bool = False,
     terrain_model: TerrainModel | None = None,
+    grounds: GroundMemory | None = None,
 ) -> Estimator:
     """An estimator for the robot and the sensors of a recording.
 
@@ -55,7 +57,7 @@ def live_estimator(
         history: collects the states.
         mode: as in `EstimatorConfig`.
         gnss: fixes will come, though the recording has none.
-        terrain_model: as in `EstimatorConfig`.
+        terrain_model, grounds: as in `EstimatorConfig`.
 
     Raises:
         DataError: the log has no IMU or no wheels, or nothing tells the robot's geometry.
@@ -68,7 +70,9 @@ def live_estimator(
     robot, _ = choose_vehicle(recording, vehicle)
     inputs = sensor_config_of(recording, recording.gnss)
     inputs = dataclasses.replace(inputs, gnss=inputs.gnss or gnss)
-    config = EstimatorConfig(robot.rig(), robot.name, mode, inputs=inputs, terrain_model=terrain_model)
+    config = EstimatorConfig(
+        robot.rig(), robot.name, mode, inputs=inputs, terrain_model=terrain_model, grounds=grounds
+    )
     if history is None:
         return Estimator(config)
     estimator = Estimator(

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from terrafusion.datasets.readers.ros.static_frames import STATIC, StaticFrames
 from terrafusion.fusion.estimate.estimate import STATUS, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.grounds.file import read_grounds, save_grounds
 from terrafusion.fusion.inputs.sample_stream import MOST_LATE_S
 from terrafusion.fusion.inputs.time_jumps import (
     CONFIRMED,
@@ -87,6 +89,7 @@ class LiveOptions:
         datum: latitude, longitude (deg) and height (m) of the map's origin; the first fix where it is None.
         wait_s: how long samples wait for others of the same time.
         use_sim_time: times of receipt are those of `/clock`.
+        grounds: file of the robot's ground memory: read if it is there, and written when the node ends.
         prefix: stands before the topics of odometry, slip and ground, such as "/robot1".
     """
 
@@ -102,6 +105,7 @@ class LiveOptions:
     use_sim_time: bool = False
     prefix: str = ""
     terrain_model: TerrainModel | None = None
+    grounds: Path | None = None
 
     def __post_init__(self) -> None:
         if not self.frequency > 0.0:
@@ -135,12 +139,12 @@ class LiveNode:
         self.options, self._publish, self._say, self._history = options, publish, say, history
         rig = load_vehicle(options.vehicle).rig() if options.vehicle else None
         self._request = Request(LIVE, rig=rig, topics=dict(options.topics), stamps=options.stamps)
+        self._grounds = None if options.grounds is None else read_grounds(options.grounds)
         self._gathered, self._frames = GatheredMessages(), StaticFrames()
         self._sensors: Sensors | None = None
         self.estimator: Estimator | None = None
         self.counts: Counter[str] = Counter(received=0, refused=0)
-        self._reported: set[str] = set()
-        self._topics: set[str] = set()
+        self._reported, self._topics = set[str](), set[str]()
         self._problem, self.running = "", True
         self._now_s = self._looked_s = self._diagnosed_s = time.monotonic()
         self._clock_ns, self._status = 0, ("waiting", self._now_s)
@@ -229,6 +233,9 @@ class LiveNode:
         self._use(self._ordered.rest())
         if self.estimator is not None:
             self.estimator.finish()
+            learned = self.estimator.weights.learned_grounds()
+            if self.options.grounds is not None and learned is not None:
+                save_grounds(learned, self.options.grounds)
 
     def _begin_ordering(self) -> None:
         self._ordered = OrderedSamples(self.options.wait_s)
@@ -277,14 +284,11 @@ class LiveNode:
             self._pass_on(sensors.arriving, message)
 
     def _new_estimator(self, sensors: Sensors) -> Estimator:
-        options = self.options
+        if self.estimator is not None:
+            self._grounds = self.estimator.weights.learned_grounds()
+        o = self.options
         return live_estimator(
-            sensors.recording,
-            options.vehicle,
-            self._history,
-            options.mode,
-            sensors.gnss,
-            options.terrain_model,
+            sensors.recording, o.vehicle, self._history, o.mode, sensors.gnss, o.terrain_model, self._grounds
         )
 
     def _pass_on(self, arriving: ArrivingMessages, message: RawMessage) -> None:
@@ -434,8 +438,7 @@ def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[f
         and abs(height_m) <= MOST_HEIGHT_M
     ):
         raise ConfigError(
-            f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole, or not on Earth",
-            remedy=DATUM,
+            f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole or not on Earth", remedy=DATUM
         )
     return latitude, longitude, height_m
 

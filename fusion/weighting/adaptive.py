@@ -82,7 +82,7 @@ class TerrainNoise:
         self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=MOST_CHANGES)
         self._recorded: SensorNoise | None = None
-        self._rig = config.rig
+        self._rig, self._vehicle = config.rig, config.vehicle or ""
         # Yaw slip needs both gyro and wheels as yaw sources.
         self._has_yaw_slip = config.inputs.sides and config.inputs.yaw == "gyro"
         self.per_measurement = _weighting_for(config, self)
@@ -119,8 +119,12 @@ class TerrainNoise:
             self._ground_slip.per_grade = per_grade
 
     def learned_grounds(self) -> GroundMemory | None:
-        """What the ground memory holds by now, condensed; None where there is none."""
-        return None if self.grounds is None else self.grounds.memory.condensed()
+        """What the ground memory of the robot holds by now, condensed; None where there is none."""
+        if self.grounds is None:
+            return None
+        learned = self.grounds.memory.condensed()
+        learned.robot = learned.robot or self._vehicle
+        return learned
 
     def found_grounds(self) -> list[str]:
         """Names and slip of the grounds whose own slip the estimate expects, where there are several that

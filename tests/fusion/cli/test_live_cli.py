@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.grounds.file import read_grounds
 from terrafusion.fusion.live.loop import live_estimator
 
 
@@ -35,6 +36,13 @@ def test_a_log_is_run_with_the_robot_and_in_the_mode_asked_for(
     monkeypatch.setattr("terrafusion.fusion.live.loop.live_estimator", seen)
     CliRunner().invoke(app, ["live", str(good_log), "--mode", "fixed", "--vehicle", "husky"])
     assert (made[0].config.mode, made[0].config.vehicle) == ("fixed", "husky")
+
+
+def test_a_log_leaves_what_it_learned_of_grounds(good_log: Path, tmp_path: Path) -> None:
+    path = tmp_path / "grounds.yaml"
+    done = CliRunner().invoke(app, ["live", str(good_log), "--grounds", str(path)])
+    assert done.exit_code == 0
+    assert read_grounds(path).robot == "elevate"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,10 @@ from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.datasets.writers.mcap_file import TopicMessages
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.grounds.file import read_grounds, save_grounds
+from terrafusion.fusion.grounds.ground import Ground
+from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.fusion.grounds.signature import SIGNATURE
 from terrafusion.fusion.replay import replay
 from tests.fusion.live.conftest import VEHICLE
 from tests.fusion.live.node_run import STORE, BagMessage, Run, error_m
@@ -152,6 +157,23 @@ def test_commands_reset_switch_and_move_the_datum(messages: list[BagMessage]) ->
         "refused: /terrafusion/command: unknown command 'stop'; send reset, on, off, or datum"
         in "\n".join(run.said)
     )
+
+
+def test_a_memory_of_grounds_is_kept_from_drive_to_drive(messages: list[BagMessage], tmp_path: Path) -> None:
+    """Beginning anew does not lose it, and one of another robot is refused."""
+    path = tmp_path / "grounds.yaml"
+    ground = Ground.new("gravel")
+    for _ in range(60):
+        ground = ground.seen(np.full(len(SIGNATURE), 2.0), 1.0, "2026-11-01")
+    save_grounds(GroundMemory([ground], VEHICLE), path)
+    run = Run(grounds=path).feed(messages[: len(messages) // 2], close=False)
+    run.node.receive(*command("reset"))
+    run.feed(messages[len(messages) // 2 :])
+    assert [g.name for g in read_grounds(path).grounds] == ["gravel"]
+    save_grounds(GroundMemory([ground], "husky"), path)
+    other = Run(grounds=path).feed(messages[:2000])
+    assert other.node.estimator is None
+    assert any("the memory of grounds is that of 'husky'" in line for line in other.said)
 
 
 def first(topic: TopicMessages) -> bytes:

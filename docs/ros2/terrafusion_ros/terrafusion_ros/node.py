@@ -1,6 +1,7 @@
 """The ROS 2 node: passes CDR bytes between rclpy and `terrafusion.fusion.live.node.LiveNode`."""
 
 import time
+from pathlib import Path
 
 import rclpy
 from rclpy.node import Node
@@ -15,7 +16,7 @@ from terrafusion.fusion.live.published import TYPES, Frames
 DEFAULTS = {
     "vehicle": "husky", "mode": "adaptive", "frequency": 50.0, "map_frame": "map", "odom_frame": "odom",
     "base_link_frame": "base_link", "publish_tf": True, "imu0": "", "odom0": "", "gps0": "",
-    "datum": [0.0], "wait": 0.02,
+    "datum": [0.0], "wait": 0.02, "grounds": "",
 }  # fmt: skip
 CHANNELS = {"imu0": "imu", "odom0": "wheels", "gps0": "gnss"}
 DISCOVER_S, TICK_S, DEPTH = 0.5, 0.01, 1000
@@ -32,7 +33,7 @@ class TerrafusionNode(Node):
         options = LiveOptions(
             vehicle=given["vehicle"], mode=given["mode"], topics=topics, frames=frames,
             frequency=given["frequency"], publish_tf=given["publish_tf"], datum=self.datum(),
-            wait_s=given["wait"],
+            wait_s=given["wait"], grounds=Path(given["grounds"]) if given["grounds"] else None,
         )  # fmt: skip
         self.publishers_of = {
             topic: self.create_publisher(get_message(msgtype), topic, 10) for topic, msgtype in TYPES.items()
