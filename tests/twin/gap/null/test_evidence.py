@@ -26,7 +26,7 @@ def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(reference_twin, name, 1)
     monkeypatch.setattr(gathering, "set_as_before", reference_twin.set_to_references)
     monkeypatch.setattr(reference_twin, "STARTS", {})
-    monkeypatch.setattr(reference_twin, "LATER", ())
+    monkeypatch.setattr(reference_twin, "LIMITS", ())
     short = dataclasses.replace(DRIVE, duration_s=6.5, drive=DRIVE.drive[:3])
     judged, *references = (run(number, drive=short) for number in (970, 975, 976))
     given, candidates = ([judged], references), Candidates.of(["gyro_bias"])

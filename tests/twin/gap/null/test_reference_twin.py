@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -84,10 +85,12 @@ def test_ground_that_is_too_hard_for_the_steps_is_not_tried() -> None:
     assert all(some is not None and len(some) == 1 for some in (found[0], found[2]))
 
 
-def set_to(robot: VehicleParams, file: VehicleParams) -> tuple[Model, Model]:
+def set_to(
+    robot: VehicleParams, file: VehicleParams, effects: Mapping[str, float] | None = None
+) -> tuple[Model, Model]:
     """The twin of a vehicle file, and as references of the robot set it."""
     runs = [
-        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k), name=f"reference {k}")
+        dataclasses.replace(simulate(DRIVE, vehicle=robot, seed=k, effects=effects), name=f"reference {k}")
         for k in range(RUNS)
     ]
     logs, model, _ = prepared(runs, file, "loose_sand")
@@ -109,6 +112,17 @@ def test_how_the_robot_follows_its_commands_is_that_of_the_references() -> None:
     assert "drive.max_accel_mps2 0.7" in told
     assert "(file: 1.5)" in told
     assert not differences(model, model)
+
+
+def test_limits_are_found_though_errors_hardly_depend_on_them_farther_off() -> None:
+    known = load_vehicle("elevate")
+    own = {"max_accel_mps2": 0.5, "speed_loop_p_nms": 2.0 * known.drive.speed_loop_p_nms}
+    robot = dataclasses.replace(known, drive=dataclasses.replace(known.drive, **own))
+    _, found = set_to(robot, known, STRONGER)
+    drive = found.vehicle.drive
+    assert drive.max_accel_mps2 == pytest.approx(0.5, rel=0.1)
+    assert drive.max_yaw_accel_radps2 == pytest.approx(known.drive.max_yaw_accel_radps2, rel=0.15)
+    assert drive.dead_time_s < 0.02
 
 
 def test_the_base_of_two_driven_wheels_is_found_where_nobody_measured_it() -> None:
