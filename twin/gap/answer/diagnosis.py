@@ -1,6 +1,6 @@
 """`GapDiagnosis`: the result of a diagnosis, and its form in `diagnosis.json`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from terrafusion.datasets.core.json_text import finite
@@ -42,7 +42,7 @@ class GapDiagnosis:
     shrinkage: Shrinkage
     next_run: NextRun | None
     drives: DriveCoverage | None
-    evidence: GapEvidence
+    evidence: GapEvidence = field(repr=False)
     notes: tuple[str, ...]
 
     @property
