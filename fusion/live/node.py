@@ -130,7 +130,7 @@ class LiveNode:
         history: collects the states of the estimator.
 
     Raises:
-        ConfigError: an unknown vehicle.
+        ConfigError: an unknown vehicle, or a ground memory that cannot be read.
     """
 
     def __init__(
