@@ -21,7 +21,7 @@ from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
-from terrafusion.fusion.weighting.adaptive import TerrainNoise
+from terrafusion.fusion.weighting.adaptive import UPDATE_NS, TerrainNoise
 from terrafusion.fusion.weighting.innovation import SageHusa, Variational
 from terrafusion.fusion.weighting.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
 from terrafusion.fusion.weighting.weighting import InnovationTest
@@ -279,8 +279,8 @@ def test_a_robot_the_model_does_not_know_has_the_pooled_noise_until_evidence_com
     assert weights.noise == pooled
     classes = weights.detector.classes
     sigmas = []
-    for _ in range(40):
-        weights.external(0, {name: float(name == "mud") for name in classes})
+    for i in range(40):
+        weights.external(i * UPDATE_NS, {name: float(name == "mud") for name in classes})
         assert (weights.noise == pooled) == (weights.posterior()["mud"] <= 0.5)
         sigmas.append(weights.noise.slip_sigma)
     assert sigmas == sorted(sigmas)
