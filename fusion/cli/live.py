@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.datasets.core.errors import DataError, errors_of
+from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.usage import refuse_options
@@ -130,6 +131,8 @@ def _run_robot(
     begun = time.monotonic()
     serve(bus, node, lambda: bool(stopped) or (seconds is not None and time.monotonic() - begun >= seconds))
     say(_summary(node))
+    if options.grounds is not None and options.grounds.exists():
+        say(f"the ground memory is in {options.grounds}")
     bus.close()
     if view is not None:
         view.close()
@@ -182,6 +185,7 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     learned = estimator.weights.learned_grounds()
     if options.grounds is not None and learned is not None:
         save_grounds(learned, options.grounds)
+        print(f"{counted(len(learned), 'ground')} of '{learned.robot}' to {options.grounds}")
     state = newest[0]
     print(f"{state.status}: {state.position_m.round(2).tolist()} m, slip {state.slip:.2f}")
     for line in verdict_of(estimator, history, recording).lines():

@@ -43,6 +43,7 @@ def test_a_log_leaves_what_it_learned_of_grounds(good_log: Path, tmp_path: Path)
     done = CliRunner().invoke(app, ["live", str(good_log), "--grounds", str(path)])
     assert done.exit_code == 0
     assert read_grounds(path).robot == "elevate"
+    assert f"of 'elevate' to {path}" in " ".join(done.output.split())
 
 
 @pytest.mark.parametrize(
