@@ -85,14 +85,14 @@ def _joined(folder: Path, parts: Mapping[str, Recording]) -> Recording:
             if said[key] != other[key]:
                 what = f"{a} says {said[key]}, {b} {other[key]}"
                 raise DataError(what, file=folder, channel=key, remedy="give it in one column map")
-    told = {key: value for own in stated.values() for key, value in own.items()}
-    geometry = {key: told.pop(key) for key in [f.name for f in dataclasses.fields(Overrides)] if key in told}
+    meta = {key: value for own in stated.values() for key, value in own.items()}
+    geometry = {key: meta.pop(key) for key in [f.name for f in dataclasses.fields(Overrides)] if key in meta}
     channels = {channel: getattr(parts[name], channel) for channel, name in owner.items()}
     every = parts.values()
     return Recording(
-        name=told.pop("name", folder.resolve().name),
+        name=meta.pop("name", folder.resolve().name),
         start_ns=min(part.start_ns for part in every),
-        **told,
+        **meta,
         **channels,
         overrides=Overrides(**geometry),
         unturned=tuple(channel for part in every for channel in part.unturned),
