@@ -181,6 +181,10 @@ class Estimator:
             steering = self.steering if self.config.inputs.yaw == "steering" else None
             self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m, steering), UNKNOWN)
             self._advance()
+            return
+        self.imu.go_on_without(self.wheels.t_ns)
+        if self.imu.silent_ns and self.chain.nodes and self._due() is not None:
+            self._advance()
 
     def add_steering(self, t_ns: Stamp, front_rad: float, rear_rad: float = 0.0) -> None:
         """Mean angle of the front and of the rear wheels, rad, positive to the left; of a steered robot."""

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.streams import BEFORE_PAUSE_NS
 from terrafusion.fusion.metrics.scores import Outage
 
 HELD_OUT_EVERY = 5
@@ -107,12 +108,14 @@ def feed(
 ) -> np.ndarray:
     """Give an estimator all samples in time order; returns the computing time of each keyframe, ms.
 
-    Keyframes are made as IMU samples come, or, without an IMU, as wheel samples do: what comes after the
-    last of them is left out. `progress` gets the share done, 0 to 1.
+    Keyframes are made as IMU samples come, or, without an IMU or long after its last one, as wheel samples
+    do: what comes after the last of them is left out. `progress` gets the share done, 0 to 1.
     """
-    clock = recording.imu if recording.imu is not None else recording.wheels
-    assert clock is not None
+    wheels = wheels_of(recording)
+    clock = recording.imu if recording.imu is not None else wheels
     first_ns, last_ns = int(clock.t_ns[0]), int(clock.t_ns[-1])
+    if wheels.t_ns[-1] - last_ns > BEFORE_PAUSE_NS:
+        last_ns = int(wheels.t_ns[-1])
     latencies: list[float] = []
     newest = estimator.latest()
     for message in itertools.takewhile(lambda message: message.t_ns <= last_ns, recording.messages()):

@@ -61,7 +61,7 @@ REPLACED_BY = 10
 LONGEST_PAUSE_NS = 20_000_000_000
 """A longer pause of the IMU has no keyframes: what a call computes is bounded."""
 BEFORE_PAUSE_NS = 5_000_000_000
-"""What is held beyond that while the IMU is silent: its samples may come so late."""
+"""For so long the samples of a silent IMU may still come; then the wheels go on without it."""
 USUAL_GAP_S = 0.5
 """Time between samples up to which a stream of any rate has no gap (assumed: lost messages of a 10 Hz
 sensor)."""
@@ -106,16 +106,19 @@ class ImuStream(SampleStream):
 
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
+
+    `silent_ns` is a time up to which no more samples are expected of an IMU that has fallen silent, else 0.
     """
 
     COLUMNS = ("t_ns", "gyro", "accel")
+    BEFORE = 1  # that a silent IMU keeps its last one
 
     def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
         super().__init__("imu", newest)
         self.six_axis = six_axis
         self.turn_scale = self.mounting_rad = 0.0
         self.level: Array | None = None
-        self.spikes = self.left_out = 0
+        self.spikes = self.left_out = self.silent_ns = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
         self._accel_held_ns: list[int] = []
@@ -186,20 +189,33 @@ class ImuStream(SampleStream):
 
     def next_ns(self, now_ns: int, step_ns: int) -> int:
         """Time of the keyframe after one at `now_ns`: a step on, or at the end of a pause in the samples."""
-        if not self.t_ns or self.t_ns[-1] - now_ns <= LONGEST_PAUSE_NS:
+        if not self.t_ns or max(self.t_ns[-1], self.silent_ns) - now_ns <= LONGEST_PAUSE_NS:
             return now_ns + step_ns
-        ahead_ns = self.t_ns[bisect.bisect_right(self.t_ns, now_ns)] - now_ns
+        i = bisect.bisect_right(self.t_ns, now_ns)
+        ahead_ns = (self.t_ns[i] if i < len(self.t_ns) else self.silent_ns) - now_ns
         return now_ns + (ahead_ns // step_ns if ahead_ns > LONGEST_PAUSE_NS else 1) * step_ns
 
+    def covers(self, t_ns: int) -> bool:
+        return self.silent_ns >= t_ns or super().covers(t_ns)
+
+    def go_on_without(self, wheels_ns: list[int]) -> None:
+        """Expect no more samples up to the last wheel sample but one, where that is far ahead."""
+        far = len(wheels_ns) > 1 and bool(self.t_ns) and wheels_ns[-2] - self.t_ns[-1] > BEFORE_PAUSE_NS
+        self.silent_ns = wheels_ns[-2] if far else 0
+
     def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
-        """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
-        i = bisect.bisect_right(self.t_ns, start_ns)
+        """The samples between two times, the last one cut at `end_ns`; the stream must cover it.
+
+        A silent IMU reads what it read last.
+        """
+        i, newest = bisect.bisect_right(self.t_ns, start_ns), len(self.t_ns) - 1
         segments, t = [], start_ns
         while t < end_ns:
-            until = min(self.t_ns[i], end_ns)
+            j = min(i, newest)
+            until = min(self.t_ns[i], end_ns) if i == j else end_ns
             if until > t:
-                held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
-                readings = self._for_graph(self.gyro[i], self.accel[i])
+                held = self.t_ns[j] in self._gyro_held_ns, self.t_ns[j] in self._accel_held_ns
+                readings = self._for_graph(self.gyro[j], self.accel[j])
                 segments.append(ImuSegment((until - t) * 1e-9, *readings, *held))
             t = until
             i += 1
@@ -233,6 +249,8 @@ class ImuStream(SampleStream):
         i = max(bisect.bisect_right(self.t_ns, start_ns) - 1, 0)
         j = bisect.bisect_left(self.t_ns, end_ns)
         times = self.t_ns[i : j + 1]
+        if j == len(self.t_ns):
+            times.append(end_ns)
         return max((b - a for a, b in itertools.pairwise(times)), default=0) * 1e-9
 
     def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:

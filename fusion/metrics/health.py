@@ -35,14 +35,18 @@ class Health:
 
 
 def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Health:
-    """Check that an estimate is finite and that its speed and path agree with the wheels."""
+    """Check that an estimate is finite and that its speed and path agree with the wheels.
+
+    Where the wheels end before it, so does the path that is compared.
+    """
     path = estimate.trajectory
     P = path.covariance
     finite = bool(np.isfinite(path.position_m).all() and np.isfinite(estimate.velocity_mps).all())
     certain = P is not None and bool(np.isfinite(P).all() and (np.einsum("nii->ni", P) > 0.0).all())
     speed = float(np.hypot(*estimate.velocity_mps[:, :2].T).max()) if finite else float("nan")
-    moved = float(travelled_m(path.position_m)[-1]) if finite else float("nan")
     wheels = wheels.between(int(path.t_ns[0]), int(path.t_ns[-1]) + 1)
+    end = int(np.searchsorted(path.t_ns, wheels.t_ns[-1], side="right")) if len(wheels) else len(path)
+    moved = float(travelled_m(path.position_m[:end])[-1]) if finite else float("nan")
     sides = wheels.side_speeds_mps(radius_m)
     sides = sides[np.isfinite(sides).all(axis=1)]
     fastest = float(np.abs(sides).max()) if len(sides) else 0.0
@@ -56,19 +60,21 @@ def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Hea
     elif speed > SPEED_FACTOR * fastest + SPEED_SLACK_MPS:
         why = f"{speed:.1f} m/s with wheels of at most {fastest:.1f} m/s"
     elif moved > MOST_PATH * rolled + PATH_SLACK_M:
-        moved = beyond_noise_m(path)
+        moved = beyond_noise_m(path, end)
     if not why and not LEAST_PATH * seen_m - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
         why = f"a path of {moved:.0f} m where the wheels rolled {rolled:.0f} m"
     return Health(speed, moved, rolled, why)
 
 
-def beyond_noise_m(path: Trajectory) -> float:
-    """Length of the polygon of those positions that lie beyond the noise from its corner before, m."""
+def beyond_noise_m(path: Trajectory, end: int) -> float:
+    """Length of the polygon of those of the first `end` positions that lie beyond the noise from its corner
+    before, m.
+    """
     assert path.covariance is not None
     least_m = NOISE_SIGMAS * np.sqrt(np.maximum(path.covariance[:, 0, 0], path.covariance[:, 1, 1]))
-    corner, *others = (path.position_m[:, 0] + 1j * path.position_m[:, 1]).tolist()
+    corner, *others = (path.position_m[:end, 0] + 1j * path.position_m[:end, 1]).tolist()
     length_m = 0.0
-    for place, least in zip(others, least_m[1:].tolist(), strict=True):
+    for place, least in zip(others, least_m[1:end].tolist(), strict=True):
         if (step := abs(place - corner)) > least:
             length_m, corner = length_m + step, place
     return length_m

@@ -8,6 +8,7 @@ import pytest
 from terrafusion.datasets.core.messages import GnssSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import until
+from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.inputs.streams import WheelStream
 from terrafusion.twin.simulate import simulate
@@ -182,3 +183,25 @@ def test_what_comes_while_the_imu_is_silent_is_held_for_a_while_only(husky: Esti
     state = husky.latest()
     assert state is not None
     assert state.t_ns > 89 * 10**9
+
+
+def test_wheels_go_on_without_an_imu_that_died_and_with_one_that_comes_back(husky: Estimator) -> None:
+    husky.set_start([0.0, 0.0, 0.0], 0.0)
+    states: list[State] = []
+    husky._on_state = states.append
+    t_ns, x_m = 0, 0.0
+    for wait_s, imu in ((0, True), (0, False), (100, False), (0, True)):
+        t_ns, known = t_ns + wait_s * 10**9, len(states)
+        for _ in range(1000):
+            t_ns, x_m, before = t_ns + 2 * 10**7, x_m + 0.02, len(states)
+            husky.add_wheels(t_ns, 1.0, 1.0)
+            if imu:
+                husky.add_imu(t_ns, np.zeros(3), GRAVITY)
+            assert len(states) - before < 60, "no call catches up with a pause"
+        newest = states[-1]
+        assert t_ns - newest.t_ns < 10**9
+        assert 180 < len(states) - known < 260
+        assert husky.status == ("outage" if imu else "stalled")
+        off_m, sigma_m = abs(newest.position_m[0] - x_m), newest.covariance[0, 0] ** 0.5
+        assert off_m < 3.0 * sigma_m
+        assert off_m < (2.0 if t_ns < 10**11 else 110.0)

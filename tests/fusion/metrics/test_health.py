@@ -67,3 +67,9 @@ def test_a_gap_of_the_wheels_does_not_make_the_path_too_short(drive: Callable[..
     wheels = dataclasses.replace(made.recording.wheels, t_ns=made.recording.wheels.t_ns + leap)
     estimate = dataclasses.replace(made.estimate, trajectory=dataclasses.replace(path, t_ns=path.t_ns + jump))
     assert examine_estimate(estimate, wheels, 0.3).why == ""
+
+
+def test_wheels_that_end_before_the_log_do_not_make_the_path_too_long(drive: Callable[..., Any]) -> None:
+    made = drive(seconds=60.0)
+    wheels = made.recording.wheels.select(np.arange(len(made.recording.wheels)) < 600)
+    assert examine_estimate(made.estimate, wheels, 0.3).why == ""
