@@ -10,7 +10,8 @@ from terrafusion.fusion.estimator.steering import steered_turn
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import mean_rates, wheel_increment
-from terrafusion.fusion.graph.imu_gap import turn_in_gap
+from terrafusion.fusion.graph.imu_gap import readings_in_gap
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.planar import with_centripetal_force, with_wheel_acceleration
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.steering import SteeringStream
@@ -65,11 +66,12 @@ class MotionInput:
         segments = self._imu.segments(before_ns, t_ns)
         if inputs.planar:
             segments = with_centripetal_force(segments, before)
-        in_gap, turn_rad = is_gap(self._imu.largest_gap_s(before_ns, t_ns), self._imu.t_ns), None
-        if in_gap and inputs.sides and self._turn is None:
-            sides_m = self._wheels.travelled(before_ns, t_ns)
-            turn_rad, segments = turn_in_gap(before, sides_m, self._config.rig.track_m, dt_s, segments)
-        rolled = wheels = self._increment(t_ns, segments, chain, noise)
+        in_gap = is_gap(self._imu.largest_gap_s(before_ns, t_ns), self._imu.t_ns)
+        turn_rad = self._turn_of_wheels(t_ns, before_ns, before) if in_gap else None
+        if turn_rad is not None:
+            segments = [readings_in_gap(before, turn_rad, dt_s)]
+            turn_rad = turn_rad if inputs.sides and self._turn is None else None
+        rolled = wheels = self._increment(t_ns, segments, chain, noise, in_gap)
         noise = self._learned.with_doubt(noise, t_ns, segments)
         if inputs.planar and wheels is not None:
             segments = with_wheel_acceleration(segments, before.rolling * wheels.speed_change_mps / dt_s)
@@ -81,8 +83,20 @@ class MotionInput:
         mean = MeanMotion(dt_s, None if in_gap else rolled_m, course_rad, *mean_rates(segments))
         return KeyframeMotion(mean, segments, noise, rolled_m, wheels, in_gap, turn_rad)
 
+    def _turn_of_wheels(self, t_ns: int, before_ns: int, before: KeyState) -> float | None:
+        """Turn by steering angles or by the sides, 0 of a robot with neither; None if wheels are silent."""
+        travelled = self._wheels.travelled(before_ns, t_ns)
+        if travelled is None:
+            return None
+        left_m, right_m = travelled
+        if self._turn is not None:
+            curvature_per_m = self._steering.curvature_per_m(before_ns, t_ns)
+            return self._turn.turn_rad(0.5 * (left_m + right_m), curvature_per_m or 0.0)
+        across_m = right_m - left_m if self._config.inputs.sides else 0.0
+        return before.turning * across_m / self._config.rig.track_m
+
     def _increment(
-        self, t_ns: int, segments: list[ImuSegment], chain: Chain, noise: SensorNoise
+        self, t_ns: int, segments: list[ImuSegment], chain: Chain, noise: SensorNoise, in_gap: bool
     ) -> WheelIncrement | None:
         before_ns, before = chain.nodes[-1].t_ns, chain.state(chain.last)
         travelled = self._wheels.travelled(before_ns, t_ns)
@@ -97,5 +111,6 @@ class MotionInput:
         increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
-            return self._turn.between(before_ns, t_ns, increment, self._steering, chain.covariance)
+            known = None if in_gap else chain.covariance
+            return self._turn.between(before_ns, t_ns, increment, self._steering, known)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()

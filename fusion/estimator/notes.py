@@ -96,6 +96,11 @@ def _on_samples(estimator: Estimator) -> list[str]:
     ):
         if count:
             notes.append(f"{counted(count, 'sample')} of {name} beyond {what} left out: no robot moves so")
+    if left_out := estimator.imu.left_out:
+        notes.append(
+            f"{counted(left_out, 'sample')} of imu left out: an axis is missing, or all forces are 0, as "
+            "of a driver that has lost its sensor"
+        )
     if estimator.wheels.noise.out_of_step:
         notes.append(
             "wheels: the counters are read out of step with their stamps; distances follow the speeds, and "

@@ -112,9 +112,10 @@ class SteeredTurn:
         end_ns: int,
         increment: WheelIncrement,
         steering: SteeringStream,
-        covariance: Array,
+        covariance: Array | None,
     ) -> WheelIncrement:
-        """The increment between two keyframes, under the covariance of the states at the first.
+        """The increment between two keyframes, under the covariance of the states at the first; None where
+        the gyro is missing.
 
         Where the angles are the only source of yaw, they are in the link of the keyframes, and not here.
         """
@@ -122,8 +123,12 @@ class SteeredTurn:
         increment = along(increment, steering.course_rad(start_ns, end_ns))
         if not self._by_gyro:
             return self.applied(increment, None, dt_s, 0.0)
-        rate_sigma = math.sqrt(covariance[BIAS, BIAS][5, 5])
+        rate_sigma = math.inf if covariance is None else math.sqrt(covariance[BIAS, BIAS][5, 5])
         return self.applied(increment, steering.curvature_per_m(start_ns, end_ns), dt_s, rate_sigma)
+
+    def turn_rad(self, distance_m: float, curvature_per_m: float) -> float:
+        """Turn over a distance by the measured curvature."""
+        return distance_m * float(curvature_per_m + np.array([curvature_per_m, 1.0]) @ self.mean)
 
     def applied(
         self, increment: WheelIncrement, curvature_per_m: float | None, dt_s: float, rate_sigma_radps: float
@@ -134,7 +139,7 @@ class SteeredTurn:
             increment: with the turn by the gyro, bias removed, as `yaw_rad`.
             curvature_per_m: of the measured angles; None where there is none.
             dt_s: its time.
-            rate_sigma_radps: 1 sigma of the gyro's bias.
+            rate_sigma_radps: 1 sigma of the gyro's bias; infinite without a gyro.
         """
         moved = increment.displacement_m.copy()
         moved[1] += self._ahead_m * increment.yaw_rad  # the middle of the rear axle does not go sideways
@@ -143,7 +148,7 @@ class SteeredTurn:
             return increment.without_turn()
         distance = increment.distance_m
         H = np.array([curvature_per_m, 1.0])
-        turn = distance * float(curvature_per_m + H @ self.mean)
+        turn = self.turn_rad(distance, curvature_per_m)
         own = (CURVATURE_SHARE * abs(curvature_per_m) + self._floor_per_m) ** 2
         spread = math.sqrt(float(H @ self.covariance @ H) + own)
         lasting = math.sqrt(2.0 * CORRELATED_S / dt_s)

@@ -28,25 +28,11 @@ TURN_SHARE, TURN_TIME_S = 0.1, 10.0
 _isotropic = gtsam.noiseModel.Isotropic.Sigma
 
 
-def turn_in_gap(
-    before: KeyState,
-    travelled_m: tuple[float, float] | None,
-    track_m: float,
-    dt_s: float,
-    held: list[ImuSegment],
-) -> tuple[float | None, list[ImuSegment]]:
-    """Turn, rad, of a robot whose sides `travelled_m`, and what an IMU would read on it at a steady speed.
-
-    None and the readings `held` where the wheels are silent.
-    """
-    if travelled_m is None:
-        return None, held
-    left_m, right_m = travelled_m
-    turn_rad = before.turning * (right_m - left_m) / track_m
+def readings_in_gap(before: KeyState, turn_rad: float, dt_s: float) -> ImuSegment:
+    """What an IMU would read on a robot that turns by `turn_rad` at a steady speed."""
     rate = np.array([0.0, 0.0, turn_rad / dt_s])
     force = before.rotation.T @ np.array([0.0, 0.0, GRAVITY_MPS2])
-    gyro, accel = before.bias.gyroscope() + rate, before.bias.accelerometer() + force
-    return turn_rad, [ImuSegment(dt_s, gyro, accel)]
+    return ImuSegment(dt_s, before.bias.gyroscope() + rate, before.bias.accelerometer() + force)
 
 
 def bridge(

@@ -126,7 +126,7 @@ class ImuStream(SampleStream):
         self.accel: list[Array] = []
 
     def leave_out(self, gyro_radps: ArrayLike) -> None:
-        """Count a sample that turns about z (rates (3,), rad/s) but misses another axis.
+        """Count a sample that turns about z (rates (3,), rad/s) but misses another axis, or all force.
 
         Raises:
             DataError: `MOST_INCOMPLETE` came, and none that misses none.
@@ -158,6 +158,9 @@ class ImuStream(SampleStream):
                 remedy="leave out samples with missing axes",
             )
         spike = beyond(gyro, SPIN_RADPS), beyond(accel, SHOCK_MPS2)
+        if self.six_axis and not accel.any():  # not even in free fall: the driver has lost the sensor
+            self.leave_out(gyro)
+            return
         if any(spike) and (beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2)):
             self.impossible += 1
             return

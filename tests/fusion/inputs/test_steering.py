@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import yaw_of
 from terrafusion.datasets.core.messages import SteeringSample
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.robot import KnownNumber
@@ -180,3 +181,23 @@ def test_a_late_angle_does_not_turn_back_the_clock_of_all_sensors() -> None:
     estimator.add_steering(newest - 3 * S // 2, 0.0)
     assert estimator.newest.t_ns == newest
     assert estimator.steering.t_ns == known
+
+
+def test_where_the_imu_dies_in_a_bend_the_steering_turns_the_robot() -> None:
+    own = rig()
+    estimator = Estimator(EstimatorConfig(own, inputs=SensorConfig(sides=False, gnss=False, steered=True)))
+    estimator.set_start([0.0, 0.0, 0.0], 0.0)
+    rate = np.tan(0.05) / own.wheelbase_m
+    for i in range(2000):
+        t_ns = i * S // 100
+        estimator.add_wheels(t_ns, 1.0, 1.0)
+        estimator.add_steering(t_ns, 0.05 if i < 500 else -0.05)
+        if i < 400:
+            estimator.add_imu(t_ns, [0.0, 0.0, rate], [0.0, rate, 9.80665])
+    state = estimator.latest()
+    assert state is not None
+    assert state.t_ns > 19 * S
+    assert yaw_of(state.quaternion) == pytest.approx(rate * (5.0 - 1e-9 * state.t_ns + 5.0), abs=0.02)
+    assert state.angular_velocity_radps[2] == pytest.approx(-rate, abs=0.01)
+    assert estimator._motion._turn is not None
+    assert np.abs(estimator._motion._turn.mean).max() < 0.01
