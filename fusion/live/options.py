@@ -8,8 +8,10 @@ import numpy as np
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import NEAREST_TO_POLE_DEG
+from terrafusion.datasets.readers.open import STAMPS
 from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M, as_numbers
 from terrafusion.fusion.live.published import Frames
+from terrafusion.fusion.noise.modes import MODES
 from terrafusion.fusion.terrain.classifier import TerrainModel
 
 DATUM = "give latitude and longitude in degrees and the height in metres"
@@ -49,6 +51,9 @@ class LiveOptions:
     grounds: Path | None = None
 
     def __post_init__(self) -> None:
+        for what, value, known in (("mode", self.mode, MODES), ("stamps", self.stamps, STAMPS)):
+            if value not in known:
+                raise ConfigError(f"{what} is '{value}'", remedy=f"give one of {', '.join(known)}")
         if not self.frequency > 0.0:
             raise ConfigError(f"frequency is {self.frequency}", remedy="give Hz above 0")
         if not 0.0 <= self.wait_s <= 0.5:
