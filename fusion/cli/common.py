@@ -162,6 +162,16 @@ class HowRead:
         return [clock_accepted(r) for r in found] if self.repair_clock else found
 
 
+def check_existence(logs: str | Sequence[str]) -> None:
+    """Refuse names of logs that are not there (DataError), before what takes long to import."""
+    for log in [logs] if isinstance(logs, str) else logs:
+        if not Path(log).exists():
+            from terrafusion.datasets.core.segments import split_name
+            from terrafusion.datasets.readers import files_of
+
+            files_of(split_name(log)[0])
+
+
 def styled(line: str | Line) -> str:
     """A line as it is printed: in colour where standard output is a terminal, controls written out."""
     style, text = line if isinstance(line, tuple) else ("", line)
