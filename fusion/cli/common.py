@@ -165,11 +165,14 @@ class HowRead:
 def check_existence(logs: str | Sequence[str]) -> None:
     """Refuse names of logs that are not there (DataError), before what takes long to import."""
     for log in [logs] if isinstance(logs, str) else logs:
-        if not Path(log).exists():
+        if not os.path.exists(log):  # `Path.exists` raises where a name is too long
             from terrafusion.datasets.core.segments import split_name
-            from terrafusion.datasets.readers import files_of
+            from terrafusion.datasets.readers.formats import format_of
+            from terrafusion.datasets.readers.open import find_log
 
-            files_of(split_name(log)[0])
+            place, _ = find_log(split_name(log)[0])
+            if not place.exists():
+                format_of(place)
 
 
 def styled(line: str | Line) -> str:
