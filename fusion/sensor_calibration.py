@@ -10,6 +10,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError, errors_of
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.datasets.core.tables import text_html
@@ -136,7 +137,10 @@ class SensorCalibration:
 
     def summary(self) -> list[str]:
         """The numbers as a table, and what was not observable."""
-        lines = [f"{'':16s} {'value':>9s} {'1 sigma':>8s} {'before':>9s} {'1 sigma':>8s} {'gained':>7s} nats"]
+        lines = [
+            f"Sensors of '{self.vehicle.name}' from {', '.join(self.logs)}",
+            f"{'':16s} {'value':>9s} {'1 sigma':>8s} {'before':>9s} {'1 sigma':>8s} {'gained':>7s} nats",
+        ]
         for name, n in self.numbers.items():
             status = "observed" if n.observed else "not observable"
             lines.append(
@@ -148,10 +152,14 @@ class SensorCalibration:
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def __repr__(self) -> str:
-        return "\n".join([f"Sensors of '{self.vehicle.name}' from {', '.join(self.logs)}", *self.summary()])
+        observed = [
+            f"  {name} {n.value:.4g} +- {n.sigma:.2g}" for name, n in self.numbers.items() if n.observed
+        ]
+        title = f"Sensors of '{self.vehicle.name}' from {counted(len(self.logs), 'log')}"
+        return "\n".join([title, *observed[:10], f"  {len(self.numbers) - len(observed)} not observable"])
 
     def _repr_html_(self) -> str:
-        return text_html(repr(self))
+        return text_html("\n".join(self.summary()))
 
 
 def calibrate_sensors(

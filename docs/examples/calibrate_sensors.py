@@ -17,5 +17,5 @@ arguments = parser.parse_args()
 
 logs = arguments.logs or [tf.simulate("figure_eight", terrain="asphalt", seed=1)]
 learned = tf.calibrate_sensors(logs, vehicle=arguments.vehicle)
-print(learned)  # each number before and after, and what the drives could not tell
+print("\n".join(learned.summary()))  # each number before and after, and what the drives could not tell
 print(f"next: terrafusion replay LOG --vehicle {learned.write(arguments.out)}")

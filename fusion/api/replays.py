@@ -99,7 +99,7 @@ def replay(
     known = None if vehicle is None else as_vehicle(vehicle)
     if not (grounds is None or isinstance(grounds, (str, Path, GroundMemory))):
         raise ConfigError(f"grounds is {grounds!r}", remedy="give a file, or the `grounds` of a result")
-    (recording,) = opened(log, None if known is None else known.rig())
+    (recording,) = opened([log], None if known is None else known.rig())
     if isinstance(terrain_model, (str, Path)):
         terrain_model = load_terrain_model(Path(terrain_model))
     result = run(

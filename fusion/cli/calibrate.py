@@ -145,7 +145,7 @@ def _sensors(logs: list[str], vehicle: str | None, how: common.HowRead, out: Pat
         found = calibrate_sensors(recordings, vehicle, progress=progress)
     write_robot(out, found)
     numbers = {name: one and dataclasses.asdict(one) for name, one in vars(found.known()).items()}
-    return Result(repr(found).splitlines(), f"written to {out}", {"out": str(out), "robot": numbers})
+    return Result(found.summary(), f"written to {out}", {"out": str(out), "robot": numbers})
 
 
 def split(text: str | None) -> tuple[str, ...]:

@@ -71,7 +71,8 @@ def add_command(
     Args:
         body: takes the command's own options and, where it writes, `out: Path`; returns what to print.
             The section `Args` of its docstring describes options, as `name: help` or `name (METAVAR): help`.
-            A parameter of the type `HowRead` stands for the options of that class.
+            A parameter of the type `HowRead` stands for the options of that class; the first one then is
+            the log or the logs.
         output: what it writes at `out`; gives a plain `out: Path` the option `--out`.
         instead: what it writes with an option that is called so.
         files: options that are further files to write, each with a word of the files it may replace.
@@ -97,6 +98,8 @@ def add_command(
         if verbose:
             print("\n".join(f"{key} = {value}" for key, value in given.items()), file=sys.stderr)
         with _ending_reported(given.get("out"), kind, verbose), _redirected(quiet, in_json):
+            if how_read is not None:
+                common.check_existence(given[next(iter(own))])
             result = body(**_gathered(given, how_read))
             if kind is not None and "config.json" in kind.names:
                 from terrafusion.fusion.cli.used_config import write_config

@@ -162,6 +162,19 @@ class HowRead:
         return [clock_accepted(r) for r in found] if self.repair_clock else found
 
 
+def check_existence(logs: str | Sequence[str]) -> None:
+    """Refuse names of logs that are not there (DataError), before what takes long to import."""
+    for log in [logs] if isinstance(logs, str) else logs:
+        if not os.path.exists(log):  # `Path.exists` raises where a name is too long
+            from terrafusion.datasets.core.segments import split_name
+            from terrafusion.datasets.readers.formats import format_of
+            from terrafusion.datasets.readers.open import find_log
+
+            place, _ = find_log(split_name(log)[0])
+            if not place.exists():
+                format_of(place)
+
+
 def styled(line: str | Line) -> str:
     """A line as it is printed: in colour where standard output is a terminal, controls written out."""
     style, text = line if isinstance(line, tuple) else ("", line)

@@ -102,7 +102,7 @@ def _ranges(channel: dict[str, Any]) -> str:
         if isinstance(values, dict):
             parts.append(f"{column}{GLUE}{_words(values)}")
         else:
-            low, high = (format(value, ".3g") for value in values)
+            low, high = (format(value, "z.3g") for value in values)
             parts.append(_glued(f"{column} {low}" if low == high else f"{column} {low} to {high}"))
     return "; ".join(parts)
 
@@ -121,7 +121,7 @@ def measured_texts(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
     gravity, yaw, sigma = measured["gravity"], measured["yaw"], measured["sigma_m"]
     if gravity:
-        vector = ", ".join(f"{value:.2f}" for value in gravity["mean_mps2"])
+        vector = ", ".join(f"{value:z.2f}" for value in gravity["mean_mps2"])
         text = f"({vector}) m/s2, size {gravity['size_mps2']:.2f}: along {gravity['axis']}"
         yield "gravity", f"{text}, {gravity['tilt_deg']:.1f} deg off"
     if yaw:

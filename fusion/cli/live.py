@@ -18,7 +18,8 @@ from terrafusion.fusion.cli.usage import refuse_options
 
 if TYPE_CHECKING:
     from terrafusion.fusion.estimate.estimate import State
-    from terrafusion.fusion.live.node import LiveNode, LiveOptions
+    from terrafusion.fusion.live.node import LiveNode
+    from terrafusion.fusion.live.options import LiveOptions
 
 LogArgument = Annotated[
     str | None,
@@ -74,7 +75,7 @@ def live(
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
         grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, written at the end.
     """
-    from terrafusion.fusion.live.node import LiveOptions
+    from terrafusion.fusion.live.options import LiveOptions
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
     origin = common.parse_point(datum, "LAT,LON,HEIGHT", "--datum")

@@ -26,15 +26,13 @@ from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeySt
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.grounds.ground import FRICTION_MPS2, SLIPPERY_MODELS
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 
-FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
-"""Friction limits of the models: mu g from ice to dry ground."""
-SLIPPERY_MPS2 = 2.0
-"""Limit (ice, wet or snowy ground) up to which friction may lead; above it wheels do nearly as well."""
-SLIPPERY = FRICTION_MPS2[FRICTION_MPS2 <= SLIPPERY_MPS2]
+SLIPPERY = FRICTION_MPS2[:SLIPPERY_MODELS]
+"""Limits (ice, wet or snowy ground) at which friction may lead; above them wheels do nearly as well."""
 LEAD_PROBABILITY = 0.9999
 """Probability of friction, at any limit, from which it leads on dry ground too: other causes of a bent path
 (soft ground, a hill, a jump of fixes) resemble friction sooner than rolling. Chosen on field logs."""

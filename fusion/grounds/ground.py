@@ -21,10 +21,12 @@ MOST_WINDOWS = 2000.0
 """Windows and stretches that are remembered: an older one fades, so that a ground may change."""
 FREEDOM = 8.0
 """Degrees of freedom of Student's t for signatures: some are outliers (kerbs, stones)."""
-FRICTION_MODELS = 10
-"""Friction limits of the bank and, last, rolling (`estimator.friction`)."""
+FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
+"""Friction limits of the bank (`estimator.friction`): mu g from ice to dry ground."""
+FRICTION_MODELS = len(FRICTION_MPS2) + 1
+"""These and, last, rolling."""
 SLIPPERY_MODELS = 6
-"""The first ones: limits of ice, wet and snowy ground."""
+"""The first ones: limits of ice, wet and snowy ground, up to 2 m/s2."""
 MOST_SLIP = 1.0
 """Largest slip or side-slip of a stretch that is learned."""
 

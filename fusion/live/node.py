@@ -12,16 +12,11 @@ import math
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import Any
 
-import numpy as np
-
 from terrafusion.datasets.core.channels import Gnss
-from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
-from terrafusion.datasets.core.frames import NEAREST_TO_POLE_DEG
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.messages import ImuSample
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros import topics as known
@@ -48,19 +43,16 @@ from terrafusion.fusion.inputs.time_jumps import (
     Newest,
     TimeJump,
 )
-from terrafusion.fusion.inputs.validation import MOST_HEIGHT_M, as_numbers
 from terrafusion.fusion.live import published
 from terrafusion.fusion.live.loop import live_estimator
+from terrafusion.fusion.live.options import LiveOptions, checked_datum
 from terrafusion.fusion.live.ordered import OrderedSamples
-from terrafusion.fusion.live.published import Frames
 from terrafusion.fusion.live.sensors import Sensors, find_sensors
-from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.twin.model.vehicle import load_vehicle
 
 CLOCK = ("/clock", "rosgraph_msgs/msg/Clock")
 COMMAND = ("/terrafusion/command", "std_msgs/msg/String")
 COMMANDS = "reset, on, off, or datum LATITUDE LONGITUDE HEIGHT"
-DATUM = "give latitude and longitude in degrees and the height in metres"
 LOOK_S = 1.0
 """Messages of this long show which sensors there are."""
 DIAGNOSTICS_S = 1.0
@@ -72,50 +64,6 @@ MOST_REPORTED = 200
 """Kinds of lines that are reported; later ones are only counted."""
 Say = Callable[[str], None]
 Publish = Callable[[str, str, bytes], None]
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """Settings of a node.
-
-    Attributes:
-        vehicle: name or YAML file.
-        mode, terrain_model: as in `EstimatorConfig`.
-        topics: topic by channel, as `--topic`; the others are found by type and name.
-        stamps: "header", or "receipt" for a robot whose clocks do not agree.
-        frames: names of the frames.
-        frequency: odometry a second, at most; it comes with samples of the IMU.
-        publish_tf: whether the transforms are published.
-        datum: latitude, longitude (deg) and height (m) of the map's origin; the first fix where it is None.
-        wait_s: how long samples wait for others of the same time.
-        use_sim_time: times of receipt are those of `/clock`.
-        grounds: file of the robot's ground memory: read if it is there, and written when the node ends.
-        prefix: stands before the topics of odometry, slip and ground, such as "/robot1".
-    """
-
-    vehicle: str | None = None
-    mode: str = "adaptive"
-    topics: Mapping[str, str] = field(default_factory=dict)
-    stamps: str = "header"
-    frames: Frames = field(default_factory=Frames)
-    frequency: float = 50.0
-    publish_tf: bool = True
-    datum: tuple[float, float, float] | None = None
-    wait_s: float = 0.02
-    use_sim_time: bool = False
-    prefix: str = ""
-    terrain_model: TerrainModel | None = None
-    grounds: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not self.frequency > 0.0:
-            raise ConfigError(f"frequency is {self.frequency}", remedy="give Hz above 0")
-        if not 0.0 <= self.wait_s <= 0.5:
-            raise ConfigError(f"wait is {self.wait_s} s", remedy="give 0 to 0.5 s")
-        if self.datum is not None:
-            if np.shape(self.datum) != (3,):
-                raise ConfigError(f"the datum {self.datum!r} has not three numbers", remedy=DATUM)
-            checked_datum(*self.datum)
 
 
 class LiveNode:
@@ -422,25 +370,6 @@ class LiveNode:
         if pattern not in self._reported and len(self._reported) < MOST_REPORTED:
             self._reported.add(pattern)
             self._say(line)
-
-
-def checked_datum(latitude: float, longitude: float, height_m: float) -> tuple[float, float, float]:
-    """A datum, deg and m.
-
-    Raises:
-        ConfigError: it is not on Earth, or on a pole, where no direction is east.
-        DataError: it is no numbers.
-    """
-    latitude, longitude, height_m = as_numbers((latitude, longitude, height_m), "the datum", "datum").tolist()
-    if not (
-        abs(latitude) <= 90.0 - NEAREST_TO_POLE_DEG
-        and abs(longitude) <= 180.0
-        and abs(height_m) <= MOST_HEIGHT_M
-    ):
-        raise ConfigError(
-            f"the datum {latitude:g}, {longitude:g}, {height_m:g} is on a pole or not on Earth", remedy=DATUM
-        )
-    return latitude, longitude, height_m
 
 
 def _is_number(text: str) -> bool:

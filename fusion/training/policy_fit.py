@@ -32,12 +32,15 @@ from terrafusion.fusion.training.ground_samples import (
     GroundSamples,
     samples_of,
 )
-from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all
+from terrafusion.fusion.training.simulated_runs import (
+    GROUNDS,
+    PAYLOADS_KG,
+    SCENARIOS,
+    SLOPES_DEG,
+    Grid,
+    run_all,
+)
 
-SCENARIOS = ("staircase", "figure_eight")
-"""0.3 to 1.5 m/s straight ahead in steps, with stops; 0.8 m/s in circles to both sides."""
-SLOPES_DEG = (0.0, 3.0, 6.0)
-PAYLOADS_KG = (0.0, 30.0)
 UNSEEN_YAW_SCALE, LEAST_YAW_SCALE_SIGMA = (-0.4, 0.2), 0.02
 """Mean and sigma without turns: robots turn at 0.44 to 0.71 of the rate by their track."""
 TAIL = 0.005

@@ -26,6 +26,10 @@ from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
 
 GROUNDS = ("asphalt", "medium_sand", "loose_sand", "mud")
+SCENARIOS = ("staircase", "figure_eight")
+"""0.3 to 1.5 m/s straight ahead in steps, with stops; 0.8 m/s in circles to both sides."""
+SLOPES_DEG = (0.0, 3.0, 6.0)
+PAYLOADS_KG = (0.0, 30.0)
 UPDATE_S = 0.5
 WINDOW_S = 1.0
 SLIP_SIGMA = 0.04

@@ -21,16 +21,21 @@ from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.terrain.spectrum import SpectrumClassifier
 from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.mixture import fit_best
-from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, Grid, windows_of
+from terrafusion.fusion.training.simulated_runs import (
+    GROUNDS,
+    PAYLOADS_KG,
+    SCENARIOS,
+    SLOPES_DEG,
+    Condition,
+    Grid,
+    windows_of,
+)
 from terrafusion.fusion.training.window_store import WindowStore
 from terrafusion.twin.executors import Workers, open_workers
 from terrafusion.twin.model.version import model_sha256, version
 
 LabelledWindows = tuple[list[Window], str]
 
-SCENARIOS = ("staircase", "figure_eight")
-SLOPES_DEG = (0.0, 3.0, 6.0)
-PAYLOADS_KG = (0.0, 30.0)
 CALIBRATION_SEED, SCORING_SEED, FRESH_SEED = 1000, 2000, 3000
 PATCH_LENGTH_M = 25.0
 SIGMA_FLOOR = np.array([0.03] * SLIP + [0.02, 0.05])

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafusion.datasets.core.arguments import checked_names
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.quantity import Quantity, checked_number
-from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.twin.calibrate.answer import answer_of
 from terrafusion.twin.calibrate.coordinates import Prior
@@ -18,6 +18,7 @@ from terrafusion.twin.calibrate.covariance import covariance_of
 from terrafusion.twin.calibrate.identifiability import NOT_IDENTIFIED, Identifiability, examine
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.calibrate.log import prepare
+from terrafusion.twin.calibrate.observations import checked_channels
 from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.result import CONVERGED, Calibration
 from terrafusion.twin.calibrate.solver import Solution, solve
@@ -28,6 +29,7 @@ from terrafusion.twin.calibrate.start import (
     start_model,
     uniquely_named,
 )
+from terrafusion.twin.effects.catalogue import checked
 from terrafusion.twin.model.choose import vehicle_of_logs
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
@@ -38,7 +40,8 @@ PARAMETERS = (
 )  # fmt: skip
 """What is calibrated where nothing is named."""
 
-_GROUND = {
+_RANGES = {
+    "window_s": Quantity("s", 1.0, 600.0),
     "slope_deg": Quantity("deg", 0.0, MAX_SLOPE_DEG),
     "aspect_deg": Quantity("deg", -360.0, 360.0),
     "payload_kg": Quantity("kg", 0.0, 5000.0),
@@ -56,7 +59,7 @@ def calibrate(
     source: str = "auto",
     truth: bool = False,
     robust: bool = False,
-    channels: Sequence[str] | None = None,
+    channels: str | Sequence[str] | None = None,
     window_s: float = 10.0,
     slope_deg: float = 0.0,
     aspect_deg: float = 0.0,
@@ -77,10 +80,11 @@ def calibrate(
         source: one of `inputs.SOURCES`: what drives the twin.
         truth: use the reference poses of the logs, too.
         robust: down-weight outliers (Huber).
-        channels: use only these, by name or beginning of a name (see `layout.OUTPUTS`).
-        window_s: the pose starts anew after so long.
-        slope_deg: slope of the plane that all logs were driven on.
-        aspect_deg: direction in which it rises.
+        channels: use only these, by name or beginning of a name (see `observations.CHANNELS`).
+        window_s: the pose starts anew after so long, 1 to 600 s.
+        slope_deg: slope of the plane that all logs were driven on, 0 to 25 deg.
+        aspect_deg: direction in which it rises, deg from east to the left.
+        payload_kg: mass carried at the centre of gravity.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -90,12 +94,19 @@ def calibrate(
     """
     # Inputs, checked.
     recordings = uniquely_named(tuple(opened(logs, None if vehicle is None else as_vehicle(vehicle).rig())))
-    _check(recordings, source, window_s)
+    if not recordings:
+        raise DataError("no log was given", remedy="give at least one")
+    check_source(source)
+    wanted = None if channels is None else checked_channels(checked_names(channels, "channels"))
+    given = {
+        "window_s": window_s, "slope_deg": slope_deg, "aspect_deg": aspect_deg, "payload_kg": payload_kg,
+    }  # fmt: skip
+    for key, value in given.items():
+        checked_number(value, _RANGES[key], file="the calibration", key=key)
+    checked(effects or {})
     named, said = vehicle_of_logs(recordings, vehicle)
     known = as_vehicle(named)
     recordings = tuple(opened(recordings, known.rig()))
-    for key, value in (("slope_deg", slope_deg), ("aspect_deg", aspect_deg), ("payload_kg", payload_kg)):
-        checked_number(value, _GROUND[key], file="the calibration", key=key)
     # The model to start from, and its unknown parameters.
     model, ground, notes = start_model(recordings, known, soils, effects)
     model = dataclasses.replace(
@@ -103,7 +114,6 @@ def calibrate(
     )
     coordinates = coordinates_of(parameters, model, priors or {})
     # The logs: input of the twin, windows, measurements averaged over intervals.
-    wanted = None if channels is None else tuple(channels)
     prepared = [
         prepare(r, model, source=source, truth=truth, window_s=window_s, ground=ground, channels=wanted)
         for r in recordings
@@ -115,14 +125,6 @@ def calibrate(
     # The answer.
     notes += [*said, *(f"{log.name}: {note}" for log in prepared for note in log.notes)]
     return answer_of(problem, solution, covariance, identified, notes)
-
-
-def _check(recordings: tuple[Recording, ...], source: str, window_s: float) -> None:
-    if not recordings:
-        raise DataError("no log was given", remedy="give at least one")
-    check_source(source)
-    if not 1.0 <= window_s <= 600.0:
-        raise ConfigError(f"a window of {window_s:g} s is out of range", remedy="give 1 to 600 s")
 
 
 def _search(

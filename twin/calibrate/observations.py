@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.physics.layout import OUTPUTS
 
 Rows = NDArray[np.int64]
 
@@ -28,6 +30,11 @@ LEAST_SHARE = 1e-4
 """Learnt noise is at least this share of the first guess (exact data would give zero)."""
 CURRENT_SIGMA_A = 0.05
 """Least first guess of a current sensor's sigma (assumed)."""
+CHANNELS = (
+    *(name for name in OUTPUTS if "speed" not in name),
+    *("wheel_mean_radps", "truth_east_m", "truth_north_m", "truth_yaw_rad"),
+)
+"""What can be compared: `layout.OUTPUTS` that sensors measure, the mean of all wheels, and a reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +42,7 @@ class Observed:
     """Rows of one channel.
 
     Attributes:
-        channel: name, that of `measurement.OUTPUTS` where the twin has it.
+        channel: one of `CHANNELS`.
         begin_s, end_s: (n,) interval a row is the mean over; equal where it holds at an instant.
         value: (n,) measured.
         sigma: (n,) first guess of the noise's 1 sigma.
@@ -63,6 +70,17 @@ class Observed:
             self, begin_s=self.begin_s[rows], end_s=self.end_s[rows], value=self.value[rows],
             sigma=self.sigma[rows], slot=self.slot[rows],
         )  # fmt: skip
+
+
+def checked_channels(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of channels, or beginnings of them.
+
+    Raises:
+        ConfigError: one that no channel begins with.
+    """
+    if unknown := [name for name in names if not any(one.startswith(name) for one in CHANNELS)]:
+        raise ConfigError(f"unknown channel '{unknown[0]}'", remedy=f"known are {', '.join(CHANNELS)}")
+    return names
 
 
 def observe(

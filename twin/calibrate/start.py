@@ -84,6 +84,8 @@ def coordinates_of(names: str | Sequence[str], model: Model, priors: Mapping[str
     Raises:
         ConfigError: an unknown name, or a prior of a parameter that is not calibrated.
     """
+    if not isinstance(priors, Mapping):
+        raise ConfigError(f"priors are {priors!r}", remedy="give {name: Prior(value, sigma)}")
     numbers: dict[str, Quantity] = resolve(checked_names(names, "parameters"), model)
     for name, prior in priors.items():
         if not isinstance(prior, Prior):

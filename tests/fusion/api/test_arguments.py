@@ -96,7 +96,7 @@ def test_a_simulation_refuses_wrong_arguments(wrong: dict[str, Any], message: st
         tf.simulate("straight", **wrong)
 
 
-@pytest.mark.parametrize("wrong", [None, 5, [None]])
+@pytest.mark.parametrize("wrong", [None, 5, [None], [], ["monday", "tuesday"]])
 def test_what_is_no_log_is_refused(wrong: Any) -> None:
     with pytest.raises(tf.DataError, match="is no log; give a Recording, or the path"):
         tf.replay(wrong)

@@ -94,7 +94,10 @@ def test_changed_numbers_are_recovered_within_three_sigma(found: SensorCalibrati
     assert found.unobserved() == ["course_lag_s", "slip_per_grade"]  # slip in turns is larger; no hills
     assert "not observable in these logs: course_lag_s, slip_per_grade" in found.summary()
     seen = {name: dataclasses.replace(n, gained_nats=1.0) for name, n in found.numbers.items()}
-    assert "all numbers were observed" in dataclasses.replace(found, numbers=seen).summary()
+    whole = dataclasses.replace(found, numbers=seen, notes=("a", "b"))
+    assert "all numbers were observed" in whole.summary()
+    assert max(len(repr(one).splitlines()) for one in (found, whole)) <= 12
+    assert "  gnss_delay_s 0." in repr(found)
 
 
 def test_the_second_log_starts_from_the_first(logs: list[Recording], found: SensorCalibration) -> None:

@@ -18,7 +18,7 @@ from terrafusion.fusion.cli.main import app
 
 FILES = {
     "meta.yaml": "start_ns: 1700000000000000000\nvehicle: nobody_knows\nterrain: gravel\ntrack_m: 0.5\n",
-    "imu.csv": "t_s,gyro_z_radps\n" + "".join(f"{i / 50:.2f},{i % 7 / 100}\n" for i in range(500)),
+    "imu.csv": "t_s,gyro_z_radps\n" + "".join(f"{i / 50:.2f},{(i % 7 or -0.0) / 100}\n" for i in range(500)),
     "wheels.csv": "t_s,left_mps,right_mps\n"
     + "".join(f"{i / 10:.1f},{1 + i % 3 / 10},1\n" for i in range(100)),
     "gnss.csv": "t_s,east_m,north_m,sigma_e_m,sigma_n_m,fix\n"

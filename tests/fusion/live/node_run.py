@@ -10,7 +10,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.live.node import LiveNode, LiveOptions
+from terrafusion.fusion.live.node import LiveNode
+from terrafusion.fusion.live.options import LiveOptions
 from tests.fusion.live.conftest import VEHICLE
 
 BagMessage = tuple[int, str, str, bytes]

@@ -318,6 +318,8 @@ def test_a_node_does_not_listen_to_itself() -> None:
         {"datum": (-90.0, 0.0, 0.0)},
         {"datum": (47.0, 8.0)},
         {"vehicle": "no such"},
+        {"mode": "adaptiv"},
+        {"stamps": "recipt"},
     ],
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:

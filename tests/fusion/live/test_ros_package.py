@@ -15,7 +15,8 @@ from ruamel.yaml import YAML
 from terrafusion.datasets.readers.ros.arriving import KINDS
 from terrafusion.datasets.readers.ros.streams import DEFINITIONS
 from terrafusion.datasets.readers.ros.topics import TYPES as CHANNEL_TYPES
-from terrafusion.fusion.live.node import LiveNode, LiveOptions
+from terrafusion.fusion.live.node import LiveNode
+from terrafusion.fusion.live.options import LiveOptions
 from terrafusion.fusion.live.published import TYPES, Frames
 
 ROS2 = Path(__file__).parents[3] / "docs" / "ros2"

@@ -1,7 +1,7 @@
 """The public sets held against what was told of them: `python -m tests.studies.survey.survey`.
 
 Opens every recording of the catalogue that is on this machine and prints a markdown table of what
-`survey_facts` expects beside what is found, as the files have it and as the catalogue's conventions
+`published.FACTS` expects beside what is found, as the files have it and as the catalogue's conventions
 make of it. Exit status 1 where something is found that neither was told nor is known to be otherwise.
 """
 

@@ -244,6 +244,28 @@ def test_names_that_cannot_be_calibrated(names: tuple[str, ...], word: str) -> N
         calibrate(drive(), "elevate", SOIL, names)
 
 
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"channels": "gyro"}, "unknown channel 'gyro'; known are .*yaw_rate_radps"),
+        ({"channels": ("gnss", 3)}, "'channels' is"),
+        ({"effects": {"slop": 0.05}}, "unknown effect 'slop'; did you mean slope"),
+        ({"effects": {"slope": 5.0}}, "effect 'slope/uniform' is 5.0, out of range"),
+        ({"window_s": "long"}, "'window_s' is 'long'; give a number in"),
+        ({"priors": ("x", 1.0)}, "priors are"),
+    ],
+)
+def test_arguments_that_mean_nothing(given, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        calibrate(drive(), "elevate", SOIL, NAMES, **given)
+
+
+def test_one_channel_is_that_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.twin.calibrate.solver.MAX_RUNS", 1)
+    found = calibrate(drive(), "elevate", SOIL, NAMES[:1], channels="gnss_east")
+    assert {channel.channel for channel in found.channels} == {"gnss_east_m"}
+
+
 def test_logs_that_lack_what_is_needed() -> None:
     bare = Recording("bare", 0, imu=drive().imu)
     with pytest.raises(DataError, match="neither commands nor wheel speeds"):

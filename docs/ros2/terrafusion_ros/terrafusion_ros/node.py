@@ -10,7 +10,8 @@ from rosidl_runtime_py.utilities import get_message
 from std_srvs.srv import SetBool, Trigger
 
 from terrafusion import TerrafusionError
-from terrafusion.fusion.live.node import LiveNode, LiveOptions
+from terrafusion.fusion.live.node import LiveNode
+from terrafusion.fusion.live.options import LiveOptions
 from terrafusion.fusion.live.published import TYPES, Frames
 
 DEFAULTS = {
