@@ -168,7 +168,7 @@ def check_unrelated(context: CheckContext) -> Iterator[Finding]:
         "yaw-unrelated", "warning", "imu",
         "gyro z does not follow the wheels",
         f"correlation {both.r:.2f} of the half-second means",
-        "check the IMU's axes and the two clocks; on slippery ground it may be real",
+        "check the IMU's axes, the clocks, and that both are of one robot; slippery ground does it, too",
     )  # fmt: skip
 
 
