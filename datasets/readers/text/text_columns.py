@@ -54,7 +54,7 @@ class TextColumns:
         self._layout = _layout(text, column_map, self._preface)
         text, self._repeated = _headed_once(text, self._layout)
         self.units, row = _units_below(text, self._layout)
-        self._layout = dataclasses.replace(self._layout, first_line=row)
+        self._layout = _as_wide_as_rows(text, dataclasses.replace(self._layout, first_line=row))
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -131,6 +131,17 @@ def _layout(data: bytes, column_map: ColumnMap | None, preface: int) -> TextLayo
         cells, first_line = numbered(len(cells)), number
     limits.check_columns(len(cells))
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
+
+
+def _as_wide_as_rows(data: bytes, layout: TextLayout) -> TextLayout:
+    """The layout with one nameless column more or less, where lines end in a separator but the header does
+    not, or the other way round."""
+    names, row = layout.names, next(_sample(data, layout), [])
+    if len(row) == len(names) + 1 and not row[-1]:
+        names = (*names, "")
+    elif len(row) == len(names) - 1 and not names[-1]:
+        names = names[:-1]
+    return dataclasses.replace(layout, names=names)
 
 
 def _preface(data: bytes) -> int:
