@@ -53,12 +53,12 @@ UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", 
 TIME_UNITS = ("s", "ms", "us", "ns")
 _BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
 _TIME = re.compile(
-    r"(^|_)([a-z]*time|timestamp|stamp|t|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
+    r"(^|_)([a-z]*time|timestamp|stamp|ts?|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
 )
 _WEEK = re.compile(r"(^|_)(g?wk|week|week_?n(r|o|um|umber)?|wn)$")
 _OF_WEEK = re.compile(r"(^|_)(i?tow|sow)(_|$)|of_week")
 """Names of GPS weeks, and of the time within one."""
-_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu"}
+_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu", "wheels": "wheels"}
 """Channel that a column belongs to by the sensor in front of its name: gps_speed is none of the wheels."""
 
 _SIDES = {
@@ -242,6 +242,11 @@ def starter_map(
     return f"time: {entry}, channels: {{{sections}}}"
 
 
+def is_time(name: str) -> bool:
+    """Whether a column is a time by its name."""
+    return _TIME.search(_header(name).base) is not None
+
+
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
     """The columns that a proposed map does not use."""
     return [name for name in names if name and json.dumps(name, ensure_ascii=False) not in proposal]
@@ -296,7 +301,7 @@ def _header(name: str) -> _Header:
         base = path[1]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
-    sensor = re.match(r"(imu|gps|gnss|odom|robot)_(?=.)", base)
+    sensor = re.match(r"(imu|gps|gnss|odom|robot|wheels)_(?=.)", base)
     return _Header(name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "")
 
 
