@@ -78,8 +78,8 @@ def _far_larger(context: CheckContext) -> tuple[str, str] | None:
     found = _agreements(context)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
-        if both is None or not both.is_significant() or abs(both.slope) < limit:
-            continue
+        if both is None or not both.is_significant() or not limit <= abs(both.slope) < limit / DEGREE:
+            continue  # beyond, it would be too large as deg/s, too: counts of the sensor
         label = SOURCES[other].label
         unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {label}"
         return f"the turn rate of {label}", f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}"
