@@ -321,7 +321,7 @@ def wheel_advice(
 ) -> str:
     """A note for a bag without wheels; other sensors have taken the topics `taken`."""
     others = [topic for topic in bag if topic.name not in taken and not _NEVER.search(topic.msgtype)]
-    usable = [topic for topic in others if topic.msgtype in TYPES["wheels"]]
+    usable = [t for t in others if t.msgtype in TYPES["wheels"] and not looks_commanded(t.name)]
     parts = [*_named(usable, joints_of)]
     strange = [topic for topic in others if not any(topic.msgtype in types for types in TYPES.values())]
     strange.sort(key=lambda topic: not _LIKELY.search(f"{topic.name} {topic.msgtype}"))

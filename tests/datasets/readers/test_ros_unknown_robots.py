@@ -218,6 +218,10 @@ def test_a_plain_twist_is_used_where_it_is_asked_for(tmp_path: Path) -> None:
     assert asked.wheels.speed[0].tolist() == [0.75, 1.25]
     assert asked.wheels.t_ns[0] == T0
     assert "wheels: /speed has no stamps; its times are those of arrival" in asked.notes
+    command = open_recording(
+        bag_beside_imu(tmp_path / "c", "/cmd_vel", "geometry_msgs/msg/Twist", *[twist] * 20)
+    )
+    assert "--topic" not in wheel_note(command)
 
 
 @pytest.mark.parametrize(("frame", "noted"), [("odom", True), ("base_link", False)])
