@@ -69,7 +69,7 @@ _SIDES = {
     "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
     "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
 }
-_SPEED = "v|vel|velocity|speed|ground_speed|wheel|wheel_speed|wheel_vel|wheel_velocity"
+_SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
 _ROTATION = "w|omega|rpm"
 _TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
 
@@ -88,7 +88,15 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"fix_type", "gnss", ("fix",)),
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
-    *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
+    (r"up", "gnss", ("up_m",)),
+    *(
+        (
+            rf"{word}|{word}ing|{a}|utm_?(?:{a}|{xy}|{word}|{word}ing)|(?:{a}|{xy})_?utm",
+            "gnss",
+            (f"{word}_m",),
+        )
+        for word, a, xy in (("east", "e", "x"), ("north", "n", "y"))
+    ),
     *(
         (rf"v(?:el)?_?(?:{a}|{word})|{word}_vel(?:ocity)?", "gnss", (f"v_{a if a != 'd' else 'u'}_mps",))
         for a, word in (("e", "east"), ("n", "north"), ("u", "up"), ("d", "down"))
@@ -119,7 +127,12 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
     *((_beside("motor_rpm", s), "wheels", (f"{side}_radps",)) for side, s in _SIDES.items()),
     *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
-    (r"v|vel|velocity|speed|wheel_speed|(?:twist_)?linear_x", "wheels", ("speed_mps",)),
+    (
+        r"(?:(?:wheel|odo|odometer|odometry|vehicle|forward|linear)_)?(?:v|vel|velocity|speed)"
+        r"|(?:twist_)?linear_x|linear_vel(?:ocity)?_x",
+        "wheels",
+        ("speed_mps",),
+    ),
     (r"w|omega|(?:twist_)?angular_z", "wheels", (YAW_RATE,)),
     (r"steer(?:ing)?_wheel(?:_angle)?", "steering", ("steering_wheel_rad",)),
     (r"steer(?:ing)?(?:_angle)?", "steering", ("angle_rad",)),

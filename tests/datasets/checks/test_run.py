@@ -200,4 +200,4 @@ def test_counts_of_a_gyro_are_no_degrees(drive: Recording) -> None:
     counts = dataclasses.replace(drive.imu, gyro_radps=np.degrees(drive.imu.gyro_radps) * 131.0)
     (finding,) = run_checks(dataclasses.replace(drive, imu=counts))
     assert (finding.code, finding.repair) == ("impossible-value", None)
-    assert "is the unit right" in finding.fix
+    assert "or are these counts" in finding.fix

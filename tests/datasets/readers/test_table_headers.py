@@ -315,3 +315,22 @@ def test_the_speed_of_motors_is_proposed_with_a_gear_ratio_to_fill_in(tmp_path: 
     (tmp_path / "drive.csv.columns.yaml").unlink()
     with pytest.raises(DataError, match=r"1/30: what is the gear ratio\?"):
         open_recording(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize(
+    ("names", "fields"),
+    [
+        ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
+        ("odo_speed,forward_velocity", ["speed_mps"]),
+        ("x_utm,y_utm", ["east_m", "north_m"]),
+        ("E,N", ["east_m", "north_m"]),
+        ("Easting [m],Northing [m],N", ["east_m", "north_m"]),
+        ("E,count", []),
+    ],
+)
+def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields: list[str]) -> None:
+    proposal = starter_map(["t", "gz", *names.split(",")])
+    found = [
+        name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
+    ]
+    assert found == fields
