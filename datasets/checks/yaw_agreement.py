@@ -303,9 +303,11 @@ def check_mirrored(context: CheckContext) -> Iterator[Finding]:
     left = residuals_m(context)
     if left is None or _image(context) <= 0.0:
         return
-    fix, repair = reflection(context.recording)
+    # Latitudes and longitudes have no image: then it is a gyro that no wheels confirm.
+    name = "gyro" if wheels is None and context.recording.datum is not None else "gnss"
+    fix, repair = _remedy(context, name)
     yield Finding(
-        "gnss-course", "error", "gnss",
+        CODES[name], "error", SOURCES[name].channel,
         "the path of the fixes is the mirror image of that of wheels and gyro",
         f"{left[1]:.2f} m RMS are left about the image, {left[0]:.2f} m about the path itself",
         fix,
