@@ -230,6 +230,8 @@ def starter_map(
         if header.column in (time.column, rest):
             continue
         for channel, field in _guesses(header):
+            if field == "fix" and number_in(cells.get(header.column, "") or "0") is None:
+                continue  # words, which may be none of the classes
             if field not in channels.get(channel, {}):
                 if _COUNTER.search(header.base) and _WHOLE.fullmatch(cells.get(header.column, "")):
                     header = replace(header, unit=header.unit or "ticks")

@@ -334,3 +334,9 @@ def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields
         name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
     ]
     assert found == fields
+
+
+def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:
+    names = ["t", "lat", "lon", "fix_type"]
+    assert "mavlink" in starter_map(names, ["0", "48.1", "11.5", "6"])
+    assert "fix" not in starter_map(names, ["0", "48.1", "11.5", "RTK_FIXED"])
