@@ -144,6 +144,7 @@ LIMITS = {
 }
 """Magnitudes that nothing on a ground robot reaches, by channel and unit. MEMS gyros end at 70 rad/s
 (4000 deg/s), accelerometers at 2000 m/s2 (200 g); projected coordinates at 1e7 m."""
+UNIT_OR_COUNTS = "is the unit right, or are these counts of the sensor, which need a scale?"
 
 
 def check_magnitude(context: CheckContext) -> Iterator[Finding]:
@@ -167,7 +168,7 @@ def check_magnitude(context: CheckContext) -> Iterator[Finding]:
             f"{column} is {columns[column][first]:g}, beyond anything possible",
             f"at t = {context.since_start_s(t_ns[first]):.3f} s; {int(mask.sum())} of {len(mask)} values "
             f"beyond {limits[column]:g}" + (f", {int(rows.sum())} rows in all" if len(beyond) > 1 else ""),
-            "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
+            "leave these rows out" if few else f"{UNIT_OR_COUNTS} too many rows are wrong to leave them out",
             without_rows(name, rows) if few else None,
         )  # fmt: skip
 

@@ -27,6 +27,8 @@ interval: a Warthog that skids on asphalt has 0.955 (norlab_drive)."""
 SOFT = ("medium_sand", "loose_sand", "ploughed_soil", "mud", "snow", "ice")
 """Grounds on which such slip is usual."""
 UNIT_ERROR = 0.1
+WIDEST_RADIUS = 0.2
+"""A radius makes one ratio: with an interval wider than this share of it, no radius is offered (assumed)."""
 FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
 LARGEST_WHEEL_M = 0.5
@@ -95,8 +97,9 @@ def _too_slow(context: CheckContext, scale: PathScale, evidence: str, unit: str,
     downhill = _descent(context.recording) > STEEPEST
     fitting = radius * scale.ratio
     repair: Repair | None = None
-    if scale.ratio > LARGEST_RADIUS_ERROR or downhill:
-        fix = "check wheel radius and unit"
+    uneven = scale.high - scale.low > WIDEST_RADIUS * scale.ratio
+    if scale.ratio > LARGEST_RADIUS_ERROR or downhill or uneven:
+        fix = "check wheel radius and unit" + (", and that both are of one robot" if uneven else "")
         fix += ", or did it roll downhill on braked wheels?" if downhill else ""
     elif unit == "mps":
         repair = scaled("wheels", scale.ratio, "speed")

@@ -78,8 +78,8 @@ def _far_larger(context: CheckContext) -> tuple[str, str] | None:
     found = _agreements(context)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
-        if both is None or not both.is_significant() or abs(both.slope) < limit:
-            continue
+        if both is None or not both.is_significant() or not limit <= abs(both.slope) < limit / DEGREE:
+            continue  # beyond, it would be too large as deg/s, too: counts of the sensor
         label = SOURCES[other].label
         unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {label}"
         return f"the turn rate of {label}", f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}"
@@ -168,7 +168,7 @@ def check_unrelated(context: CheckContext) -> Iterator[Finding]:
         "yaw-unrelated", "warning", "imu",
         "gyro z does not follow the wheels",
         f"correlation {both.r:.2f} of the half-second means",
-        "check the IMU's axes and the two clocks; on slippery ground it may be real",
+        "check the IMU's axes, the clocks, and that both are of one robot; slippery ground does it, too",
     )  # fmt: skip
 
 
@@ -303,9 +303,11 @@ def check_mirrored(context: CheckContext) -> Iterator[Finding]:
     left = residuals_m(context)
     if left is None or _image(context) <= 0.0:
         return
-    fix, repair = reflection(context.recording)
+    # Latitudes and longitudes have no image: then it is a gyro that no wheels confirm.
+    name = "gyro" if wheels is None and context.recording.datum is not None else "gnss"
+    fix, repair = _remedy(context, name)
     yield Finding(
-        "gnss-course", "error", "gnss",
+        CODES[name], "error", SOURCES[name].channel,
         "the path of the fixes is the mirror image of that of wheels and gyro",
         f"{left[1]:.2f} m RMS are left about the image, {left[0]:.2f} m about the path itself",
         fix,

@@ -19,6 +19,17 @@ MAP_SUFFIX = ".columns.yaml"
 """Appended to the name of a table, the name of its column map."""
 PARQUET_MAGIC = b"PAR1"
 
+EXPORT = "export it as a table (.csv) or a bag"
+HINTS = (
+    *(
+        (start, "unpack it, and give what is inside")
+        for start in (b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")
+    ),
+    *((start, "write it with one object a line (.jsonl)") for start in (b"[", b"{")),
+    (b"ULog", "export it by ulog2csv of pyulog as tables (.csv)"),
+)
+"""How to go on with a file that is not read, by its first bytes."""
+
 
 @dataclass(frozen=True)
 class Request:
@@ -87,6 +98,7 @@ FORMATS: tuple[Format, ...] = (
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.sets.norlab_pickle"),
     Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.sets.pathfinder_mat"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.sets.borealtc_csv"),
+    Format("dataflash", "a DataFlash log of ArduPilot (.bin)", f"{_READERS}.dataflash"),
     Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.text.xsens_text"),
     Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.text.rtklib_pos"),
     Format("nmea", "an NMEA 0183 log", f"{_READERS}.text.nmea"),
@@ -129,10 +141,11 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if found is None:
         kinds = ", ".join(form.description for form in FORMATS)
+        first = next((hint for start, hint in HINTS if head.startswith(start)), EXPORT)
         raise DataError(
             f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
             file=path,
-            remedy=f"export it as a table (.csv) or a bag; what can be read: {kinds}",
+            remedy=f"{first}; what can be read: {kinds}",
         )
     return found
 

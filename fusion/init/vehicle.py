@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from terrafusion.datasets.checks import Finding, repair, run_checks
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.measures import Measures, measure
+from terrafusion.datasets.checks.wheels import check_wheel_signs
 from terrafusion.datasets.core.errors import ConfigError, DataError, errors_of
 from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.recording import Recording
@@ -113,7 +115,7 @@ def first_vehicle(
     named = DraftLine(extended, "what is not below is as of this vehicle")
     head: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
     tail = _messages(recording, answers)
-    measured, geometry = _geometry(recording, answers, base, rig)
+    measured, geometry = _geometry(_turning_alike(recording, rig), answers, base, rig)
     with scratch_folder() as folder, _errors_of_log(folder, first.name):
         file = folder / "vehicle.yaml"
         recording, axes, repaired, findings = _mounted(open_log, head | geometry | tail, file)
@@ -162,6 +164,12 @@ def _geometry(
     if base.name != "generic":  # what nobody measured here is better known in its own file
         lines = {name: line for name, line in lines.items() if not line.assumed}
     return measured, lines
+
+
+def _turning_alike(recording: Recording, rig: Rig) -> Recording:
+    """The log with both sides forwards, as it is repaired later: their mean gives the radius."""
+    found = check_wheel_signs(CheckContext(recording, rig))
+    return next((finding.repair(recording) for finding in found if finding.repair), recording)
 
 
 def _messages(recording: Recording, answers: Answers) -> Draft:

@@ -76,6 +76,7 @@ def write_samples(folder: Path) -> list[Path]:
         _xsens,
         _pos,
         _nmea,
+        _dataflash,
         _tables,
     ):
         write(folder)
@@ -269,3 +270,9 @@ def _tables(folder: Path) -> None:
     packed = _sample(folder, "parquet", "drive.parquet")
     table.to_parquet(packed / "drive.parquet", index=False)
     (packed / "drive.parquet.columns.yaml").write_text(MAP)
+
+
+def _dataflash(folder: Path) -> None:
+    from tests.datasets.dataflash_files import log
+
+    (_sample(folder, "dataflash", "rover.bin") / "rover.bin").write_bytes(log())

@@ -164,7 +164,8 @@ def _of_one_robot(
     """The bag without topics of other robots than that of the wheels; chooses the wheels where they are open.
 
     A namespace with wheels and another sensor is a robot's, and so are those named alike but for a number or
-    a letter (husky_1, husky_2) that hold both together.
+    a letter (husky_1, husky_2) that hold both together. Whether these are boards of one robot is asked where
+    none has what another has.
     """
     sensors = [(t, kind) for t in bag for kind in SENSORS if t.msgtype in TYPES[kind]]
     paths = [t.name.split("/") for t, _ in sensors]
@@ -179,6 +180,9 @@ def _of_one_robot(
         alike = [other for other in spaces if _ROBOT.sub("", other) == _ROBOT.sub("", space)]
         if len(robots) < 2 <= len(alike) and _makes_a_robot(kind for one in alike for kind in spaces[one]):
             robots = alike
+            held = [(kind, topics[0].name) for one in alike for kind, topics in spaces[one].items()]
+            if not chosen and len(dict(held)) == len(held):
+                raise _robots_or_boards(alike, dict(held))
     if len(robots) < 2:
         return bag
     if "wheels" not in chosen:
@@ -190,6 +194,15 @@ def _of_one_robot(
         return bag
     notes.append(f"not used: {', '.join(others)}, as of other robots; name what is of this one with --topic")
     return [topic for topic in bag if not topic.name.startswith(others)]
+
+
+def _robots_or_boards(spaces: Sequence[str], held: Mapping[str, str]) -> DataError:
+    """The question whether namespaces, whose sensors are `held` by kind, are of one robot."""
+    every = " ".join(f"--topic {kind}={name}" for kind, name in held.items())
+    return DataError(
+        f"{', '.join(spaces)} may be boards of one robot, or robots",
+        remedy=f"of one robot: {every}; of several: --topic wheels={held['wheels']} leaves the others out",
+    )
 
 
 def _makes_a_robot(kinds: Iterable[str]) -> bool:
@@ -308,7 +321,7 @@ def wheel_advice(
 ) -> str:
     """A note for a bag without wheels; other sensors have taken the topics `taken`."""
     others = [topic for topic in bag if topic.name not in taken and not _NEVER.search(topic.msgtype)]
-    usable = [topic for topic in others if topic.msgtype in TYPES["wheels"]]
+    usable = [t for t in others if t.msgtype in TYPES["wheels"] and not looks_commanded(t.name)]
     parts = [*_named(usable, joints_of)]
     strange = [topic for topic in others if not any(topic.msgtype in types for types in TYPES.values())]
     strange.sort(key=lambda topic: not _LIKELY.search(f"{topic.name} {topic.msgtype}"))

@@ -23,10 +23,15 @@ FIX_OF_CODE: dict[str, dict[int, Fix]] = {
     "rtklib": dict(enumerate((Fix.NONE, Fix.FIXED, Fix.FLOAT, Fix.DGPS, Fix.DGPS, Fix.SINGLE, Fix.FLOAT))),
     "navsatfix": {-1: Fix.NONE, 0: Fix.SINGLE, 1: Fix.DGPS, 2: Fix.FIXED}
     | {18: Fix.DGPS, 19: Fix.FIXED, 20: Fix.FLOAT, 33: Fix.DGPS},
+    "mavlink": dict(
+        enumerate((Fix.NONE, Fix.NONE, Fix.SINGLE, Fix.SINGLE, Fix.DGPS, Fix.FLOAT, Fix.FIXED, Fix.FIXED))
+    )
+    | {8: Fix.FLOAT},
 }
 """GGA: 1 GPS, 2 differential, 3 PPS, 4 RTK, 5 float RTK, 6 estimated. RTKLIB's Q: 1 fix, 2 float, 3 SBAS,
 4 DGPS, 5 single, 6 PPP (taken as float). Status of sensor_msgs/NavSatFix: 0 fix, 1 SBAS, 2 ground-based; of
-gps_msgs/GPSFix also 18 DGPS, 19 RTK, 20 float RTK, 33 WAAS."""
+gps_msgs/GPSFix also 18 DGPS, 19 RTK, 20 float RTK, 33 WAAS. GPS_FIX_TYPE of MAVLink, as in logs of PX4 and
+ArduPilot: 2 and 3 a fix, 4 DGPS, 5 float, 6 fixed, 7 static base, 8 PPP (taken as float)."""
 
 
 @dataclass(frozen=True, eq=False)

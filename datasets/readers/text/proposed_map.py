@@ -21,6 +21,8 @@ from terrafusion.datasets.readers.text.column_map import (
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
+GEAR = "1/30"
+"""Scale proposed for the speed of motors: nothing in a table tells the gear ratio."""
 _WORDS = {
     "deg/s": "deg/s|°/s|dps|degps|degs|deg_s|deg_per_s|deg/sec",
     "rad/s": "rad/s|radps|rads|rad_s|rad/sec|rads^-1",
@@ -51,12 +53,12 @@ UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", 
 TIME_UNITS = ("s", "ms", "us", "ns")
 _BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
 _TIME = re.compile(
-    r"(^|_)([a-z]*time|timestamp|stamp|t|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
+    r"(^|_)([a-z]*time|timestamp|stamp|ts?|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
 )
 _WEEK = re.compile(r"(^|_)(g?wk|week|week_?n(r|o|um|umber)?|wn)$")
 _OF_WEEK = re.compile(r"(^|_)(i?tow|sow)(_|$)|of_week")
 """Names of GPS weeks, and of the time within one."""
-_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu"}
+_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu", "wheels": "wheels"}
 """Channel that a column belongs to by the sensor in front of its name: gps_speed is none of the wheels."""
 
 _SIDES = {
@@ -67,7 +69,8 @@ _SIDES = {
     "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
     "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
 }
-_SPEED, _ROTATION = "v|vel|velocity|speed|wheel|wheel_speed|wheel_vel|wheel_velocity", "w|omega|rpm"
+_SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
+_ROTATION = "w|omega|rpm"
 _TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
 
 
@@ -81,9 +84,23 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
     (r"alt|altitude|height|h", "gnss", ("height_m",)),
     (r"(?:fix_)?qual(?:ity)?|q|status_status", "gnss", ("fix",)),
+    (r"s_?acc|speed_acc(?:uracy)?", "gnss", ("sigma_v_mps",)),
+    (r"fix_type", "gnss", ("fix",)),
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
-    *((rf"{word}", "gnss", (f"{word}_m",)) for word in ("east", "north", "up")),
+    (r"up", "gnss", ("up_m",)),
+    *(
+        (
+            rf"{word}|{word}ing|{a}|utm_?(?:{a}|{xy}|{word}|{word}ing)|(?:{a}|{xy})_?utm",
+            "gnss",
+            (f"{word}_m",),
+        )
+        for word, a, xy in (("east", "e", "x"), ("north", "n", "y"))
+    ),
+    *(
+        (rf"v(?:el)?_?(?:{a}|{word})|{word}_vel(?:ocity)?", "gnss", (f"v_{a if a != 'd' else 'u'}_mps",))
+        for a, word in (("e", "east"), ("n", "north"), ("u", "up"), ("d", "down"))
+    ),
     *(
         (
             rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}|w_rs_s_{a}",
@@ -92,7 +109,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         )
         for i, a in enumerate("xyz")
     ),
-    (r"yaw_?rate|gyro_yaw|yaw_dot|gyro", "imu", ("gyro_z_radps",)),
+    (r"yaw_?rate|(?:gyro_)?yaw_velocity|gyro_yaw|yaw_dot|gyro", "imu", ("gyro_z_radps",)),
     *(
         (
             rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc|(?:total_)?acceler(?:ation|ometer))_?{a}"
@@ -108,8 +125,14 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         for side, s in _SIDES.items()
     ),
     *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
+    *((_beside("motor_rpm", s), "wheels", (f"{side}_radps",)) for side, s in _SIDES.items()),
     *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
-    (r"v|vel|velocity|speed|wheel_speed|(?:twist_)?linear_x", "wheels", ("speed_mps",)),
+    (
+        r"(?:(?:wheel|odo|odometer|odometry|vehicle|forward|linear)_)?(?:v|vel|velocity|speed)"
+        r"|(?:twist_)?linear_x|linear_vel(?:ocity)?_x",
+        "wheels",
+        ("speed_mps",),
+    ),
     (r"w|omega|(?:twist_)?angular_z", "wheels", (YAW_RATE,)),
     (r"steer(?:ing)?_wheel(?:_angle)?", "steering", ("steering_wheel_rad",)),
     (r"steer(?:ing)?(?:_angle)?", "steering", ("angle_rad",)),
@@ -139,7 +162,8 @@ _COURSE = re.compile(r"(^|_)(bearing|course|cog|g_?crs|track_angle|direction)(_|
 _COUNTER, _WHOLE = re.compile(r"(^|_)(enc|encoder)(_|$)"), re.compile(r"-?\d+")
 """Whole numbers of an encoder are ticks."""
 _SCALED = 1e6
-"""A latitude or longitude above that is in 1e-7 deg; heights beside it are in mm (as MAVLink has them)."""
+"""A latitude or longitude above that is in 1e-7 deg; heights and whole numbers beside it are in mm and mm/s
+(as u-blox and MAVLink have them)."""
 _LONGEST_STEP_S = 2.0
 """Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
 _IN_G = (0.85, 1.15)
@@ -150,6 +174,7 @@ _NMEA_PLACE = re.compile(r"-?\d{4,5}\.\d+")
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
+    ("gnss", ("v_e_mps", "v_n_mps")),
     ("motor", ("left_a", "right_a")),
     ("motor", ("left_v", "right_v")),
     ("truth", ("x_m", "y_m")),
@@ -205,6 +230,8 @@ def starter_map(
         if header.column in (time.column, rest):
             continue
         for channel, field in _guesses(header):
+            if field == "fix" and number_in(cells.get(header.column, "") or "0") is None:
+                continue  # words, which may be none of the classes
             if field not in channels.get(channel, {}):
                 if _COUNTER.search(header.base) and _WHOLE.fullmatch(cells.get(header.column, "")):
                     header = replace(header, unit=header.unit or "ticks")
@@ -212,10 +239,13 @@ def starter_map(
                 channels.setdefault(channel, {})[field] = place or _entry(header, field)
     channels = _complete(channels) or {"imu": {"gyro_z_radps": "NAME"}}
     gnss = channels.get("gnss", {})
-    if "1e-7 deg" in gnss.get("latitude_deg", ""):
-        height = next((h for h in headers if _guess(h) == ("gnss", "height_m")), None)
-        if height is not None and not height.unit:
-            gnss["height_m"] = _entry(replace(height, unit="mm"), "height_m")
+    if "1e-7 deg" in gnss.get("latitude_deg", ""):  # a receiver's own integers
+        for header in headers:
+            for channel, field in _guesses(header):
+                whole = field == "height_m" or _WHOLE.fullmatch(cells.get(header.column, ""))
+                small = {"m": "mm", "mps": "mm/s"}.get(field.rpartition("_")[2], "")
+                if channel == "gnss" and field in gnss and small and whole and not header.unit:
+                    gnss[field] = _entry(replace(header, unit=small), field)
     if gnss and any(_COURSE.search(h.base) for h in headers) and "speed_mps" in channels.get("wheels", {}):
         del channels["wheels"]
     sections = ", ".join(
@@ -227,15 +257,22 @@ def starter_map(
     return f"time: {entry}, channels: {{{sections}}}"
 
 
+def is_time(name: str) -> bool:
+    """Whether a column is a time by its name."""
+    return _TIME.search(_header(name).base) is not None
+
+
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
     """The columns that a proposed map does not use."""
-    return [name for name in names if json.dumps(name, ensure_ascii=False) not in proposal]
+    return [name for name in names if name and json.dumps(name, ensure_ascii=False) not in proposal]
 
 
 def _guesses(header: _Header) -> list[tuple[str, str]]:
     """Channels and fields that a column may stand for."""
     if _LEVEL.fullmatch(header.base):
         return [("gnss", "sigma_e_m"), ("gnss", "sigma_n_m")]
+    if header.base == "fix_type" and not header.column.endswith(header.base):
+        return []  # u-blox's fixType has other codes
     guess = _guess(header)
     return [] if guess is None else [guess]
 
@@ -279,7 +316,7 @@ def _header(name: str) -> _Header:
         base = path[1]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
-    sensor = re.match(r"(imu|gps|gnss|odom|robot)_(?=.)", base)
+    sensor = re.match(r"(imu|gps|gnss|odom|robot|wheels)_(?=.)", base)
     return _Header(name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "")
 
 
@@ -304,11 +341,15 @@ def _entry(header: _Header, field: str) -> str:
     if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
         return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
     if field == "fix":
-        codes = "navsatfix" if header.base.endswith("status") else "nmea"
+        codes = {"status_status": "navsatfix", "fix_type": "mavlink"}.get(header.base, "nmea")
         return f"{{column: {name}, unit: {codes}}}"
     own = VARIANCE if "covariance" in header.base else next(iter(units_of(field)))
     if own == VARIANCE:
         return f"{{column: {name}, unit: {VARIANCE}}}"
+    if "motor_rpm" in header.base:
+        return f"{{column: {name}, unit: rpm, scale: {GEAR}}}"
+    if field == "v_u_mps" and re.search(r"d$|down", header.base):
+        return f"{{column: {name}, unit: {header.unit or own}, sign: '-'}}"
     if header.column == field or header.unit in ("", own):
         return name
     return f"{{column: {name}, unit: {header.unit}}}"

@@ -39,12 +39,14 @@ from terrafusion.datasets.readers.text.column_map import (
     units_of,
 )
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.proposed_map import TICKS, left_out, starter_map
+from terrafusion.datasets.readers.text.json_lines import is_json_lines
+from terrafusion.datasets.readers.text.proposed_map import GEAR, TICKS, left_out, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 PACKED = (".csv.gz", ".tsv.gz")
+JSON_SUFFIXES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 
 _OF_HOUR = re.compile(r"\d\d:\d\d\.\d+")
 SHOWN_COLUMNS = 60
@@ -59,6 +61,8 @@ TableColumns = TextColumns | ParquetColumns
 def claims(path: Path, head: bytes) -> bool:
     """Whether a file is Parquet, or text that ends as tables do (.txt, .dat: with rows of one length)."""
     if head.startswith(PARQUET_MAGIC) or path.name.lower().endswith(PACKED):
+        return True
+    if path.suffix.lower() in JSON_SUFFIXES and is_json_lines(head):
         return True
     if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
         return False
@@ -112,12 +116,13 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
         proposal = f"header: none, {proposal}"
         given = f"{', '.join(names)} (first row: {', '.join(first)})"
     else:
-        given = ", ".join(names)
-    ticks = f" ({TICKS}: how many ticks make a turn?)" if TICKS in proposal else ""
+        given = ", ".join(filter(None, names))
+    open_scales = {TICKS: "how many ticks make a turn?", GEAR: "what is the gear ratio?"}
+    ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
     unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
     return DataError(
         f"nothing says what the columns {given} are",
-        remedy=f"correct this proposal, whose fields and units are guesses{ticks}{unused} "
+        remedy=f"correct this proposal, whose fields and units are guesses{ask}{unused} "
         "(entries: Plain tables in docs/reference/formats.md), and save it as "
         f"{path.name}{MAP_SUFFIX}: {{{proposal}}}",
     )

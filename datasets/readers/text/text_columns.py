@@ -26,7 +26,9 @@ from terrafusion.datasets.readers.delimited import (
     separator_of,
     split,
 )
+from terrafusion.datasets.readers.formats import HEAD_BYTES
 from terrafusion.datasets.readers.text.column_map import ColumnMap
+from terrafusion.datasets.readers.text.json_lines import is_json_lines, json_table
 from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
@@ -49,12 +51,18 @@ class TextColumns:
     def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
         text = read_text(path, any_encoding=True)
-        headed = column_map is None or column_map.header != "none"
-        self._preface = _preface(text) if headed else 0
-        self._layout = _layout(text, column_map, self._preface)
-        text, self._repeated = _headed_once(text, self._layout)
-        self.units, row = _units_below(text, self._layout)
-        self._layout = dataclasses.replace(self._layout, first_line=row)
+        self.units: list[str] = []
+        self._preface = self._repeated = self._timeless = 0
+        if is_json_lines(text[:HEAD_BYTES]):
+            names, text, self._timeless = json_table(text)
+            self._layout = TextLayout(tuple(names), ",", 1)
+        else:
+            headed = column_map is None or column_map.header != "none"
+            self._preface = _preface(text) if headed else 0
+            self._layout = _layout(text, column_map, self._preface)
+            text, self._repeated = _headed_once(text, self._layout)
+            self.units, row = _units_below(text, self._layout)
+            self._layout = _as_wide_as_rows(text, dataclasses.replace(self._layout, first_line=row))
         self._text, self._commas = _with_points(text, self._layout)
         self.names = list(self._layout.names)
         self.notes: list[str] = []
@@ -67,6 +75,7 @@ class TextColumns:
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
         self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
         self.notes += [again] if self._repeated else []
+        self.notes += [f"{counted(self._timeless, 'line')} without a time left out"] if self._timeless else []
         self.notes += (
             [f"{counted(self._preface, 'line')} in front of the header left out"] if self._preface else []
         )
@@ -131,6 +140,17 @@ def _layout(data: bytes, column_map: ColumnMap | None, preface: int) -> TextLayo
         cells, first_line = numbered(len(cells)), number
     limits.check_columns(len(cells))
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
+
+
+def _as_wide_as_rows(data: bytes, layout: TextLayout) -> TextLayout:
+    """The layout with one nameless column more or less, where lines end in a separator but the header does
+    not, or the other way round."""
+    names, row = layout.names, next(_sample(data, layout), [])
+    if len(row) == len(names) + 1 and not row[-1]:
+        names = (*names, "")
+    elif len(row) == len(names) - 1 and not names[-1]:
+        names = names[:-1]
+    return dataclasses.replace(layout, names=names)
 
 
 def _preface(data: bytes) -> int:

@@ -128,3 +128,16 @@ def test_fixes_too_coarse_for_courses_tell_swapped_wheels_from_a_gyro_of_the_wro
     turned = dataclasses.replace(level, gyro_radps=gyro * [1.0, 1.0, -1.0])
     _, found = repair(dataclasses.replace(bare, imu=turned), RIG)
     assert [(finding.code, "assumed" in finding.fix) for finding in found] == [("yaw-sign", False)]
+
+
+def test_without_sides_the_gyro_is_wrong_where_fixes_have_latitudes(coarse: Recording) -> None:
+    assert coarse.imu is not None
+    assert coarse.wheels is not None
+    speed = coarse.wheels.speed.mean(axis=1, keepdims=True) * RIG.wheel_radius_m
+    body = dataclasses.replace(coarse.wheels, speed=speed, names=("speed",), unit="mps", angle_rad=None)
+    imu = dataclasses.replace(coarse.imu, gyro_radps=coarse.imu.gyro_radps * [1.0, 1.0, -1.0])
+    imu = dataclasses.replace(imu, accel_mps2=np.full_like(imu.accel_mps2, np.nan))
+    log = dataclasses.replace(coarse, truth=None, command=None, wheels=body, imu=imu)
+    for datum, code in (((48.0, 11.0, 500.0), "yaw-sign"), (None, "gnss-course")):
+        (finding,) = run_checks(dataclasses.replace(log, datum=datum), RIG)
+        assert finding.code == code

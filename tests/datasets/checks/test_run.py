@@ -193,3 +193,11 @@ def test_what_another_finding_brings_about_waits_for_its_repair(
 
     assert found(1) == ["wheel-radius"]
     assert found(4) == ["stuck", "gaps", "stuck"]
+
+
+def test_counts_of_a_gyro_are_no_degrees(drive: Recording) -> None:
+    assert drive.imu is not None
+    counts = dataclasses.replace(drive.imu, gyro_radps=np.degrees(drive.imu.gyro_radps) * 131.0)
+    (finding,) = run_checks(dataclasses.replace(drive, imu=counts))
+    assert (finding.code, finding.repair) == ("impossible-value", None)
+    assert "or are these counts" in finding.fix

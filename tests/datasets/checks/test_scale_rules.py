@@ -114,14 +114,18 @@ def test_a_larger_wheel_is_repaired_by_its_radius_or_the_speeds(
     assert repaired.speed == pytest.approx(1.1 * drive.wheels.speed * RADIUS_M)
 
 
-@pytest.mark.parametrize(("ratio", "repaired"), [(2.19, True), (2.21, False)])
-def test_beyond_twice_the_radius_nothing_is_repaired(
-    drive: Recording, monkeypatch: pytest.MonkeyPatch, ratio: float, repaired: bool
+@pytest.mark.parametrize(
+    ("ratio", "half", "repaired"),
+    [(2.19, 0.001, True), (2.21, 0.001, False), (1.4, 0.13, True), (1.4, 0.15, False)],
+)
+def test_beyond_twice_the_radius_and_where_stretches_disagree_nothing_is_repaired(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch, ratio: float, half: float, repaired: bool
 ) -> None:
     silent = dataclasses.replace(drive, command=None)
-    (finding,) = judged(silent, monkeypatch, ratio)
+    (finding,) = judged(silent, monkeypatch, ratio, half)
     assert (finding.repair is not None) == repaired
     assert ("check wheel radius and unit" in finding.fix) != repaired
+    assert ("both are of one robot" in finding.fix) == (half == 0.15)
 
 
 def sloping(drive: Recording, descent: float) -> Recording:

@@ -164,7 +164,12 @@ def test_of_two_robots_in_a_bag_one_is_asked_for(tmp_path: Path, a: str, b: str)
 
 def test_wheels_of_one_robot_are_not_joined_with_the_imu_of_its_twin(tmp_path: Path) -> None:
     messages = [*imu_messages(MAKE2, "/robot_a/imu"), *odometry_messages(MAKE2, "/robot_b/odom")]
-    assert set(open_recording(write_ros2(tmp_path / "two", messages)).channels()) == {"wheels"}
+    path = write_ros2(tmp_path / "two", messages)
+    with pytest.raises(DataError, match=r"boards of one robot.*--topic imu=/robot_a/imu .*wheels=/robot_b/o"):
+        open_recording(path)
+    topics = {"wheels": "/robot_b/odom"}
+    assert set(open_recording(path, topics=topics).channels()) == {"wheels"}
+    assert set(open_recording(path, topics=topics | {"imu": "/robot_a/imu"}).channels()) == {"imu", "wheels"}
     messages = [*imu_messages(MAKE2, "/sensors/imu"), *odometry_messages(MAKE2, "/base/odom")]
     assert set(open_recording(write_ros2(tmp_path / "one", messages)).channels()) == {"imu", "wheels"}
 
@@ -213,6 +218,10 @@ def test_a_plain_twist_is_used_where_it_is_asked_for(tmp_path: Path) -> None:
     assert asked.wheels.speed[0].tolist() == [0.75, 1.25]
     assert asked.wheels.t_ns[0] == T0
     assert "wheels: /speed has no stamps; its times are those of arrival" in asked.notes
+    command = open_recording(
+        bag_beside_imu(tmp_path / "c", "/cmd_vel", "geometry_msgs/msg/Twist", *[twist] * 20)
+    )
+    assert "--topic" not in wheel_note(command)
 
 
 @pytest.mark.parametrize(("frame", "noted"), [("odom", True), ("base_link", False)])

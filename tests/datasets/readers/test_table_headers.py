@@ -280,3 +280,63 @@ def test_a_proposal_reads_accuracy_and_g_and_names_what_it_leaves_out(tmp_path: 
     assert recording.gnss is not None
     assert recording.gnss.sigma_enu_m[0, :2].tolist() == [0.5, 0.5]
     assert recording.gnss.fix.tolist() == [Fix.FIXED]
+
+
+@pytest.mark.parametrize(("header", "end"), [("t,gz,speed", ","), ("t,gz,speed,", ""), ("t,gz,speed,", ",")])
+def test_lines_may_end_in_a_separator(header: str, end: str, tmp_path: Path) -> None:
+    recording = proposed(tmp_path, f"{header}\n0,90,7.2{end}\n0.1,90,7.2{end}\n")
+    assert recording.wheels is not None
+    assert recording.wheels.speed.tolist() == [[7.2], [7.2]]
+
+
+def test_integers_of_a_receiver_are_proposed_in_its_units(tmp_path: Path) -> None:
+    names = "iTOW,lat,lon,height,hAcc,vAcc,velN,velE,velD,sAcc,fixType"
+    row = "481000000,115000000,500000,15,30,-1250,600,20,100,3"
+    recording = proposed(tmp_path, f"{names}\n1000,{row}\n1200,{row}\n")
+    assert recording.gnss is not None
+    assert recording.gnss.sigma_enu_m[0] == pytest.approx([0.015, 0.015, 0.03])
+    assert recording.gnss.velocity_enu_mps is not None
+    assert recording.gnss.velocity_enu_mps[0] == pytest.approx([0.6, -1.25, -0.02])
+    assert recording.gnss.sigma_v_mps is not None
+    assert recording.gnss.sigma_v_mps[0] == pytest.approx(0.1)
+    assert recording.gnss.fix[0] == Fix.SINGLE
+
+
+def test_the_fix_type_of_mavlink_is_proposed(tmp_path: Path) -> None:
+    recording = proposed(tmp_path, "t,lat,lon,fix_type\n0,48,11,1\n1,48,11,4\n2,48,11,5\n3,48,11,6\n")
+    assert recording.gnss is not None
+    assert recording.gnss.fix.tolist() == [Fix.DGPS, Fix.FLOAT, Fix.FIXED]
+
+
+def test_the_speed_of_motors_is_proposed_with_a_gear_ratio_to_fill_in(tmp_path: Path) -> None:
+    recording = proposed(tmp_path, "t,motor_rpm_left,motor_rpm_right\n0,300,600\n")
+    assert recording.wheels is not None
+    assert recording.wheels.speed[0] == pytest.approx([np.pi / 3, 2 * np.pi / 3])
+    (tmp_path / "drive.csv.columns.yaml").unlink()
+    with pytest.raises(DataError, match=r"1/30: what is the gear ratio\?"):
+        open_recording(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize(
+    ("names", "fields"),
+    [
+        ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
+        ("odo_speed,forward_velocity", ["speed_mps"]),
+        ("x_utm,y_utm", ["east_m", "north_m"]),
+        ("E,N", ["east_m", "north_m"]),
+        ("Easting [m],Northing [m],N", ["east_m", "north_m"]),
+        ("E,count", []),
+    ],
+)
+def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields: list[str]) -> None:
+    proposal = starter_map(["t", "gz", *names.split(",")])
+    found = [
+        name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
+    ]
+    assert found == fields
+
+
+def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:
+    names = ["t", "lat", "lon", "fix_type"]
+    assert "mavlink" in starter_map(names, ["0", "48.1", "11.5", "6"])
+    assert "fix" not in starter_map(names, ["0", "48.1", "11.5", "RTK_FIXED"])

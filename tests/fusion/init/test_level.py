@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.fusion.init.answers import Answers
@@ -74,6 +74,27 @@ def test_a_bend_is_no_tilt_whatever_the_wheels() -> None:
     small = Answers("small", wheel_radius_m=KnownNumber(0.09, "measured"))
     draft = first_vehicle(lambda rig: log, log, small).draft
     assert "imu_roll_rad" not in draft
+
+
+def test_a_motor_mounted_mirrored_is_repaired_before_the_radius_is_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("terrafusion.fusion.init.vehicle._calibrated", lambda *args: (None, ()))
+    t_ns = np.arange(0, 60 * 10**9, 2 * 10**7)
+    v, rate = 1.0 + 0.3 * np.sin(np.arange(3000) / 200), 0.1 + 0.2 * np.sin(np.arange(3000) / 300)
+    place = np.cumsum(v * np.exp(1j * np.cumsum(rate) * 0.02)) * 0.02
+    sides = np.stack([v - 0.3 * rate, -v - 0.3 * rate], axis=1) / 0.15
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (3000, 8))
+    gyro, force = noise[:, :3] + np.outer(rate, [0, 0, 1]), noise[:, 3:6] + [0.0, 0.0, 9.81]
+    enu = np.stack([place.real, place.imag, 0.0 * rate], axis=1)[::10] + noise[::10, 5:]
+    fixes = Gnss(t_ns[::10], enu, np.full((300, 3), 0.01), np.full(300, Fix.FIXED, dtype=np.uint8))
+    imu, wheels = Imu(t_ns, gyro, force), Wheels(t_ns, sides, ("left", "right"), "radps")
+    log = Recording("mirrored", 0, imu=imu, wheels=wheels, gnss=fixes)
+    found = first_vehicle(lambda rig: log, log, Answers("mirrored"))
+    assert [finding.code for finding in found.repaired] == ["wheel-sign"]
+    radius = found.draft["wheel_radius_m"].value
+    assert isinstance(radius, KnownNumber)
+    assert radius.number == pytest.approx(0.15, rel=0.02)
 
 
 def test_a_straight_drive_up_a_slope_gets_a_remedy_and_no_number() -> None:
