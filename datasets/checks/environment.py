@@ -6,14 +6,11 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, changed, changed_field, scaled
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.channels import Barometer, Magnetometer
 
-PRESSURE_PA = (30e3, 110e3)
-"""Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""
 CODES = {"barometer": "pressure-unit", "magnetometer": "field-unit"}
 FIELDS = {"barometer": "pressure_pa", "magnetometer": "field_t"}
 PRESSURE_UNITS = {"hPa": 1e2, "kPa": 1e3}
-FIELD_T = (15e-6, 80e-6)
-"""Size of the field: Earth's is 22 to 67 uT (World Magnetic Model 2020), widened by iron of the robot."""
 FIELD_UNITS = {"uT": 1e-6, "gauss": 1e-4, "milligauss": 1e-7, "nT": 1e-9}
 NORMALISED = (0.85, 1.25)
 """Lengths of fields that were divided by the local field's size, as Xsens devices give them."""
@@ -33,9 +30,15 @@ def check_pressure(context: CheckContext) -> Iterator[Finding]:
         return
     size = float(np.median(known))
     yield from _range(
-        "barometer", "pressure", size, PRESSURE_PA, PRESSURE_UNITS, "Pa", "name the unit of the pressures"
+        "barometer",
+        "pressure",
+        size,
+        Barometer.POSSIBLE_PA,
+        PRESSURE_UNITS,
+        "Pa",
+        "name the unit of the pressures",
     )
-    low, high = PRESSURE_PA
+    low, high = Barometer.POSSIBLE_PA
     beyond = (known < low) | (known > high)
     if low <= size <= high and beyond.any():
         yield Finding(
@@ -60,7 +63,7 @@ def check_field(context: CheckContext) -> Iterator[Finding]:
     fix = (
         "give the field in tesla: only its direction is known" if normalised else "name the unit of the field"
     )
-    findings = list(_range("magnetometer", "field", size, FIELD_T, FIELD_UNITS, "T", fix))
+    findings = list(_range("magnetometer", "field", size, Magnetometer.POSSIBLE_T, FIELD_UNITS, "T", fix))
     yield from findings
     if not findings:
         yield from _hard_iron(field)

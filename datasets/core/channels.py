@@ -289,6 +289,9 @@ class Barometer(Channel):
     SAMPLE = messages.BarometerSample
     pressure_pa: Array
 
+    POSSIBLE_PA: ClassVar[tuple[float, float]] = (30e3, 110e3)
+    """Where robots drive: 9 km high (International Standard Atmosphere) to below the Dead Sea."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Magnetometer(Channel):
@@ -298,6 +301,9 @@ class Magnetometer(Channel):
     COLUMNS: ClassVar[dict[str, tuple[str, ...]]] = {"field_t": ("field_x_t", "field_y_t", "field_z_t")}
     SAMPLE = messages.MagnetometerSample
     field_t: Array
+
+    POSSIBLE_T: ClassVar[tuple[float, float]] = (15e-6, 80e-6)
+    """Size of the field: Earth's is 22 to 67 uT (World Magnetic Model 2020), widened by iron of the robot."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,6 +9,7 @@ from typing import Any
 from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog, locate, sha256_of
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, apply, turned_as_mounted
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers.formats import Format, Request, format_of
@@ -66,7 +67,7 @@ def open_recordings(
     request = Request(place, rig, topics, stamps, repair_clock, map_file, pinned, conventions)
     recordings = form.read(request)
     if number is not None and number >= len(recordings):
-        what = f"holds {len(recordings)} recordings, numbered from 0"
+        what = f"holds {counted(len(recordings), 'recording')}, numbered from 0"
         raise DataError(what, file=place, remedy="give a smaller number")
     chosen = recordings if number is None else [recordings[number]]
     found = [

@@ -14,6 +14,7 @@ from gtsam.symbol_shorthand import X
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa
+from terrafusion.datasets.core.channels import Barometer
 from terrafusion.datasets.core.sensors import BarometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.slow_bias import BiasedSensor, SlowBias
@@ -22,7 +23,6 @@ from terrafusion.fusion.graph.key_state import POSE, KeyState
 
 GENERIC = BarometerSpec(rate_hz=10.0, noise_pa=10.0, walk_paps_sqrthz=0.5, position_m=(0.0, 0.0, 0.0))
 """For a vehicle whose file has no barometer (assumed: a MEMS sensor outdoors)."""
-POSSIBLE_PA = (30e3, 110e3)
 INTERVAL_NS = 1_000_000_000
 MOST_AGE_NS = 3_000_000_000
 UNKNOWN_M = 1e4
@@ -66,7 +66,8 @@ class BarometerAiding(BiasedSensor[float]):
 
     def add(self, t_ns: int, pressure_pa: float) -> None:
         """One pressure; impossible values are rejected."""
-        if POSSIBLE_PA[0] <= pressure_pa <= POSSIBLE_PA[1]:
+        low, high = Barometer.POSSIBLE_PA
+        if low <= pressure_pa <= high:
             self._samples.append((int(t_ns), float(pressure_pa)))
         else:
             self.refused += 1

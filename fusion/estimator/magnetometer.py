@@ -20,6 +20,7 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.channels import Magnetometer
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import MagnetometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
@@ -31,7 +32,6 @@ from terrafusion.fusion.inputs.streams import axes_turned
 
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
 """For a vehicle whose file has no magnetometer (assumed: calibrated once)."""
-EARTH_T = (15e-6, 80e-6)
 VERTICAL_T = 50e-6
 """About the largest vertical field outside the polar regions (World Magnetic Model 2020)."""
 INTERVAL_NS = 1_000_000_000
@@ -95,7 +95,8 @@ class FieldReference:
     def accepts(self, t_ns: int, level_t: Array) -> bool:
         """Whether a levelled field (3,) resembles those before; accepted fields move the reference slowly."""
         size = float(np.linalg.norm(level_t))
-        if not EARTH_T[0] <= size <= EARTH_T[1]:
+        low, high = Magnetometer.POSSIBLE_T
+        if not low <= size <= high:
             return False
         dip = -math.asin(float(level_t[2]) / size)
         if self.size_t == 0.0:

@@ -129,7 +129,7 @@ def _vector(values: ArrayLike | None, count: int, what: str, channel: str) -> Ar
 
 
 def _sides(values: Array, factor: float, names: tuple[str, ...]) -> tuple[float, float]:
-    """Left and right, times a factor: what `channels.sides` gives, for one sample at a time."""
+    """Left and right of one sample, times a factor."""
     scaled = [factor * value for value in values.tolist()]
     if len(scaled) == 1:
         return scaled[0], scaled[0]
