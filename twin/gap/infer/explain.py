@@ -138,7 +138,7 @@ class _Explainer:
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
-        basis = np.arange(len(self.evidence.candidates.keys), m.shared - self.robot.misfit)
+        basis = np.arange(self.evidence.candidates.count, m.shared - self.robot.misfit)
         values, vectors = np.linalg.eigh(m.K[np.ix_(basis, basis)])
         square = np.square(UNKNOWN_SIZES)[:, None]
         grown = 1.0 + square * np.maximum(values, 0.0)
@@ -227,7 +227,11 @@ def _close_look(
         parts = [metric([r for r in runs if r is not run], own.sigma, own.robot) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(plain, [found[i,] for i in index])
+    single = [found[i,] for i in index]
+    best = {fit.laws[0].effect: fit for fit in sorted(single, key=lambda fit: fit.evidence)}
+    # Where one side has changed, it is beside the point what a change of both would resemble.
+    is_composite = evidence.candidates.is_composite
+    alike = _same_signatures(plain, [f for f in single if f in best.values() or not is_composite(*f.laws)])
     every = _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
     whole = excess(look.metric)
     left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()} if whole else {}
@@ -268,10 +272,11 @@ def _by_effect(
     groups = dict[Sets, list[Fitted]]()
     for some, fit in every.items():
         groups.setdefault(tuple(sorted(laws.names[i].effect for i in some)), []).append(fit)
-    forms = Counter(law.effect for law in laws.names)
+    # One that is composite is as probable as another, and takes nothing from those.
+    forms = Counter(law.effect for law in laws.names if not laws.candidates.is_composite(law))
     evidence = {
         effects: float(np.logaddexp.reduce([fit.evidence for fit in some]))
-        - math.log(math.prod(forms[effect] for effect in effects))
+        - math.log(math.prod(forms[effect] or 1 for effect in effects))
         for effects, some in groups.items()
     }
     fits = {effects: max(some, key=lambda fit: fit.evidence) for effects, some in groups.items()}
