@@ -6,7 +6,7 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import SIDES_BY_NAME, Form, Parameter, Quantities, Term, on_side, one, two
+from terrafusion.twin.effects.form import SIDES_BY_NAME, Form, Parameter, Quantities, on_side, one, two
 from terrafusion.twin.physics.smooth import grown, smooth_abs
 
 WHEEL_SPEEDS = ("wheel_left_radps", "wheel_right_radps")
@@ -24,10 +24,6 @@ MULTIPATH_M, SLOW_MPS = 10.0, 0.3
 
 def _scaled(q: Quantities, names: tuple[str, ...], factor: Any) -> dict[str, Any]:
     return {name: q[name] * factor for name in names}
-
-
-def _scaled_on(side: str) -> Term:
-    return lambda q, e: _scaled(q, (f"wheel_{side}_radps",), 1.0 + e)
 
 
 def _in_loop(q: Quantities, share: Any) -> dict[str, Any]:
@@ -101,18 +97,14 @@ FORMS = (
     ),
     *(
         Form(
-            "encoder_scale", name, one("", 0.02, -0.5, 0.5), {"measurement": _scaled_on(name)},
-            f"{name} wheels read w (1 + e); the speed loop does not know", "scale factor", composite=True,
-        )
-        for name in SIDES_BY_NAME
-    ),
-    *(
-        Form(
             "encoder_scale", f"{name}_in_loop", one("", 0.02, -0.5, 0.5),
-            {"motor": on_side(side, _in_loop), "measurement": _scaled_on(name)},
+            {
+                "motor": on_side(side, _in_loop),
+                "measurement": lambda q, e, of=speed: _scaled(q, (of,), 1.0 + e),
+            },
             f"{name} wheels read w (1 + e), and the speed loop closes on it", "scale factor", composite=True,
         )
-        for name, side in SIDES_BY_NAME.items()
+        for speed, (name, side) in zip(WHEEL_SPEEDS, SIDES_BY_NAME.items(), strict=True)
     ),
     Form(
         "encoder_dropout", "share", one("", 0.02, 0.0, 1.0),

@@ -68,7 +68,7 @@ ODD = {
 """Parameters that change their sign where left and right are exchanged."""
 LOPSIDED = {
     "wheel_radius_asymmetry/one_wheel", "wheel_radius_asymmetry/left", "wheel_radius_asymmetry/right",
-    "torque_limit/weak_left", "torque_limit/weak_right", "encoder_scale/left", "encoder_scale/right",
+    "torque_limit/weak_left", "torque_limit/weak_right",
     "encoder_scale/left_in_loop", "encoder_scale/right_in_loop",
 }  # fmt: skip
 

@@ -130,8 +130,6 @@ SIGNS = [
     ("drivetrain_friction/efficiency", "straight", "current_left_a", 1.0),
     ("encoder_scale/reading", "straight", "wheel_left_radps", 1.0),
     ("encoder_scale/in_loop", "straight", "speed_mps", -1.0),
-    ("encoder_scale/left", "straight", "wheel_left_radps", 1.0),
-    ("encoder_scale/right", "straight", "wheel_right_radps", 1.0),
     ("encoder_scale/left_in_loop", "straight", "yaw_rate_radps", 1.0),
     ("encoder_scale/right_in_loop", "straight", "yaw_rate_radps", -1.0),
     ("encoder_dropout/share", "straight", "wheel_left_radps", -1.0),

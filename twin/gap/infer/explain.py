@@ -35,6 +35,7 @@ SECOND, GROWTH = 18, 3.0
 WEIGHINGS = 2  # of channels
 LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
+SURELY = math.log(20.0)  # log evidence by which a composite law must be ahead of its effect's others
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
 much as a law is wrong."""
@@ -228,10 +229,11 @@ def _close_look(
         return [laws.fit(part, some).values for part in parts]
 
     single = [found[i,] for i in index]
-    best = {fit.laws[0].effect: fit for fit in sorted(single, key=lambda fit: fit.evidence)}
+    effects = {fit.laws[0].effect for fit in single}
+    shown = [_shown([f for f in single if f.laws[0].effect == e], laws) for e in effects]
     # Where one side has changed, it is beside the point what a change of both would resemble.
-    is_composite = evidence.candidates.is_composite
-    alike = _same_signatures(plain, [f for f in single if f in best.values() or not is_composite(*f.laws)])
+    is_composite = laws.candidates.is_composite
+    alike = _same_signatures(plain, [f for f in single if f in shown or not is_composite(*f.laws)])
     every = _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
     whole = excess(look.metric)
     left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()} if whole else {}
@@ -279,8 +281,14 @@ def _by_effect(
         - math.log(math.prod(forms[effect] or 1 for effect in effects))
         for effects, some in groups.items()
     }
-    fits = {effects: max(some, key=lambda fit: fit.evidence) for effects, some in groups.items()}
+    fits = {effects: _shown(some, laws) for effects, some in groups.items()}
     return Explanation(evidence, fits, outside, alike, left_out)
+
+
+def _shown(fits: Sequence[Fitted], laws: Laws) -> Fitted:
+    """The most probable; with a composite law, which may claim a side, where the others surely fit less."""
+    claims = [any(map(laws.candidates.is_composite, fit.laws)) for fit in fits]
+    return max(zip(fits, claims, strict=True), key=lambda one: one[0].evidence - SURELY * one[1])[0]
 
 
 def _near(size: float) -> float:
