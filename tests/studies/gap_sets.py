@@ -181,7 +181,7 @@ def make(number: int, jobs: int = 1) -> dict[str, Any]:
     with one_blas_thread():
         evidence = gather_evidence(runs, references, vehicle, of.soil, candidates, jobs=jobs)
         sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
-        robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+        robot = learn_offsets([score(r, sigma) for r in evidence.references], candidates.count)
         drives = drive_coverage(evidence.runs, evidence.references, evidence.model)
         evidence, robot = with_law_misfit(evidence, sigma, robot)
         found = detect([score(r, sigma) for r in evidence.runs], robot, candidates, 0)

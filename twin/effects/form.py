@@ -104,6 +104,8 @@ class Form:
         equation: the law, in words of the docs.
         source: author and year, or "ours" for a phenomenological law.
         candidate: whether a diagnosis tries it without being asked for it by name.
+        composite: whether others together do nearly the same, as where one side has changed: a diagnosis
+            seeks it in the judged runs alone; references could not tell a column of its own from the others'.
     """
 
     effect: str
@@ -113,6 +115,7 @@ class Form:
     equation: str
     source: str = "ours"
     candidate: bool = True
+    composite: bool = False
 
     def __post_init__(self) -> None:
         unknown = [stage for stage in self.terms if stage not in STAGES]
@@ -176,6 +179,14 @@ def two(names: tuple[str, str], unit: str, scale: float, limit: float) -> tuple[
 def braked(q: Quantities, torque: Any) -> dict[str, Any]:
     """A wheel with a torque against its rotation."""
     return {"drag_torque_nm": q["drag_torque_nm"] + torque}
+
+
+SIDES_BY_NAME = {"left": 1, "right": -1}
+
+
+def on_side(side: int, term: Term) -> Term:
+    """A term on the wheels of one side alone: 1 left, -1 right."""
+    return lambda q, *values: term(q, *values) if q["side"] == side else {}
 
 
 def turning_beside(q: Quantities, e: Any) -> dict[str, Any]:

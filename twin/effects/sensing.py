@@ -6,7 +6,7 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Parameter, Quantities, one, two
+from terrafusion.twin.effects.form import SIDES_BY_NAME, Form, Parameter, Quantities, on_side, one, two
 from terrafusion.twin.physics.smooth import grown, smooth_abs
 
 WHEEL_SPEEDS = ("wheel_left_radps", "wheel_right_radps")
@@ -24,6 +24,10 @@ MULTIPATH_M, SLOW_MPS = 10.0, 0.3
 
 def _scaled(q: Quantities, names: tuple[str, ...], factor: Any) -> dict[str, Any]:
     return {name: q[name] * factor for name in names}
+
+
+def _in_loop(q: Quantities, share: Any) -> dict[str, Any]:
+    return {"loop_speed_radps": q["loop_speed_radps"] * (1.0 + share)}
 
 
 def _added(q: Quantities, names: tuple[str, ...], values: tuple[Any, ...]) -> dict[str, Any]:
@@ -86,10 +90,21 @@ FORMS = (
     Form(
         "encoder_scale", "in_loop", one("", 0.02, -0.5, 0.5),
         {
-            "motor": lambda q, e: {"loop_speed_radps": q["loop_speed_radps"] * (1.0 + e)},
+            "motor": _in_loop,
             "measurement": lambda q, e: _scaled(q, WHEEL_SPEEDS, 1.0 + e),
         },
         "reads w (1 + e), and the speed loop closes on it", "scale factor",
+    ),
+    *(
+        Form(
+            "encoder_scale", f"{name}_in_loop", one("", 0.02, -0.5, 0.5),
+            {
+                "motor": on_side(side, _in_loop),
+                "measurement": lambda q, e, of=speed: _scaled(q, (of,), 1.0 + e),
+            },
+            f"{name} wheels read w (1 + e), and the speed loop closes on it", "scale factor", composite=True,
+        )
+        for speed, (name, side) in zip(WHEEL_SPEEDS, SIDES_BY_NAME.items(), strict=True)
     ),
     Form(
         "encoder_dropout", "share", one("", 0.02, 0.0, 1.0),

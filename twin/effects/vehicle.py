@@ -5,7 +5,16 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Parameter, Quantities, braked, one, turning_beside
+from terrafusion.twin.effects.form import (
+    SIDES_BY_NAME,
+    Form,
+    Parameter,
+    Quantities,
+    braked,
+    on_side,
+    one,
+    turning_beside,
+)
 from terrafusion.twin.physics.layout import WHEELS
 from terrafusion.twin.physics.smooth import grown
 
@@ -72,6 +81,11 @@ def _slack(q: Quantities, share: Any) -> dict[str, Any]:
     return {"drive_torque_nm": q["drive_torque_nm"] * (1.0 - share * (1.0 - q["play"] * q["play"]))}
 
 
+def _weaker(q: Quantities, share: Any) -> dict[str, Any]:
+    """The motor's current does not show it."""
+    return {"drive_torque_nm": q["drive_torque_nm"] * (1.0 - share)}
+
+
 def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
     """exp(-share E / energy_j), E the energy drawn so far."""
     return ca.exp(-share * q["electric_energy"] / energy_j)
@@ -135,6 +149,14 @@ FORMS = (
         {"corner": lambda q, e: {"radius_m": q["radius_m"] * (1.0 + e)} if q["side"] + q["end"] == 2 else {}},
         "front left wheel R (1 + e)", "geometry",
     ),
+    *(
+        Form(
+            "wheel_radius_asymmetry", name, one("", 0.02, -0.3, 0.3),
+            {"corner": on_side(side, lambda q, e: {"radius_m": q["radius_m"] * (1.0 + e)})},
+            f"{name} wheels R (1 + e)", "geometry", composite=True,
+        )
+        for name, side in SIDES_BY_NAME.items()
+    ),
     Form(
         "track_width", "scale", one("", 0.05, -0.5, 0.5),
         {"vehicle": lambda q, e: {"track_m": q["track_m"] * (1.0 + e)}}, "track (1 + e)", "geometry",
@@ -153,6 +175,17 @@ FORMS = (
         "torque_limit", "heating", one("", 0.2, 0.0, 3.0),
         {"motor": lambda q, e: {"torque_limit_nm": q["torque_limit_nm"] * _fallen(q, e, WARMING_J)}},
         "torque limit times exp(-e E / 1 kJ), E drawn so far", "ours: derating",
+    ),
+    Form(
+        "torque_limit", "weak_motors", one("", 0.2, -0.5, 0.9), {"wheel": _weaker},
+        "the motors' current gives 1 - e of its torque", "worn magnets", composite=True,
+    ),
+    *(
+        Form(
+            "torque_limit", f"weak_{name}", one("", 0.2, -0.5, 0.9), {"wheel": on_side(side, _weaker)},
+            f"the current of the {name} motors gives 1 - e of its torque", "worn magnets", composite=True,
+        )
+        for name, side in SIDES_BY_NAME.items()
     ),
     Form(
         "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0),

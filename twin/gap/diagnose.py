@@ -112,9 +112,9 @@ def diagnose_evidence(
     normal = [score(run, sigma) for run in evidence.references]
     if uncalibrated:
         notes.append(TOO_FEW.format(counted(len(normal), "reference run"), FEWEST))
-        in_common = learn_offsets(normal, len(candidates.keys)).mean if normal else 0.0
+        in_common = learn_offsets(normal, candidates.count).mean if normal else 0.0
         normal += replicates(evidence.references or runs, sigma, in_common)
-    offsets = learn_offsets(normal, len(candidates.keys), evidence.jobs, of_twin=uncalibrated)
+    offsets = learn_offsets(normal, candidates.count, evidence.jobs, of_twin=uncalibrated)
     planner = Planner.of(evidence, sigma, offsets, scores)
     judged, robot = evidence, offsets
     if not uncalibrated:

@@ -202,7 +202,7 @@ INJECTIONS = (
     Injection("wheels scaled", "wheels", 0.03, "", ALIKE, _READS, scaled_wheels),
     Injection(
         "left wheel scaled", "wheels", 0.03, "", ("wheel_radius_asymmetry",),
-        {"wheel_radius_asymmetry/sides": -1.0}, scaled_left,
+        {"wheel_radius_asymmetry/left": -1.0, "wheel_radius_asymmetry/sides": -1.0}, scaled_left,
     ),
     Injection(
         "counts lost", "wheels", 0.03, "", ALIKE, {k: -v for k, v in _READS.items()}, lost_counts

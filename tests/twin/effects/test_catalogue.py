@@ -66,7 +66,11 @@ ODD = {
     "cross_slope/uniform", "cross_slope/camber",
 }  # fmt: skip
 """Parameters that change their sign where left and right are exchanged."""
-LOPSIDED = {"wheel_radius_asymmetry/one_wheel"}
+LOPSIDED = {
+    "wheel_radius_asymmetry/one_wheel", "wheel_radius_asymmetry/left", "wheel_radius_asymmetry/right",
+    "torque_limit/weak_left", "torque_limit/weak_right",
+    "encoder_scale/left_in_loop", "encoder_scale/right_in_loop",
+}  # fmt: skip
 
 ENDS = [(f, end) for f in FORMS for end in ("low", "scale", "high") if any(at(f, end).values())]
 each_form = pytest.mark.parametrize("form", FORMS, ids=named)

@@ -286,7 +286,7 @@ def test_lifted_wheels_carry_no_load(wide: GapDiagnosis) -> None:
 def _separations(d: GapDiagnosis, one: str, other: str, *names: str) -> list[float]:
     """Sigmas that two effects of typical size differ by with each drive beside the judged runs; "": none."""
     e, sigma = d.evidence, initial_state_sigma(d.evidence.candidates)
-    robot = learn_offsets([score(r, sigma) for r in e.references], len(e.candidates.keys))
+    robot = learn_offsets([score(r, sigma) for r in e.references], e.candidates.count)
     planner = Planner.of(e, sigma, robot, [score(r, sigma) for r in e.runs])
     by_name = {c.effect: c for c in d.verdict.causes}
     causes = [dataclasses.replace(by_name[n], value=np.ones(len(by_name[n].columns))) for n in (one, other)]

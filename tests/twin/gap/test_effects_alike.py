@@ -43,6 +43,29 @@ def test_rolling_resistance_dry_friction_and_suction_are_one_set(
     assert "which these drives cannot tell apart" in " ".join(" ".join(screen(found)).split())
 
 
+@pytest.mark.parametrize(
+    ("effect", "alike"),
+    [
+        ({"wheel_radius_asymmetry/right": -0.05}, "encoder_scale"),
+        ({"torque_limit/weak_left": 0.3}, "cg_lateral"),
+    ],
+)
+def test_a_change_of_one_side_is_one_cause_with_its_size(
+    references: list[Recording], effect: dict[str, float], alike: str
+) -> None:
+    """Before there were laws of one side, it was a pair of effects, or a centre of gravity for certain."""
+    found = diagnose(runs(900, 2, effect), references, VEHICLE)
+    answer = checked(found)
+    ((key, value),) = effect.items()
+    name = key.split("/")[0]
+    assert len(answer["named"]) == 1
+    assert name in answer["sets"][0]["effects"]
+    assert {*answer["sets"][0]["effects"]} <= {name, alike}
+    (cause,) = (c for c in answer["causes"] if c["effect"] == name)
+    number = cause["parameters"][key]
+    assert abs(number["value"] - value) < 2.0 * number["sigma"] < 0.8 * abs(value)
+
+
 def test_sigma_covers_a_delay_on_top_of_one_that_references_have() -> None:
     """Their own delay is removed to first order only, so the further one comes out 8 ms too long."""
     late = {"imu_time_offset/shift": 0.05}

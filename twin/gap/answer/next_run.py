@@ -93,13 +93,17 @@ class Planner:
 
     def propose(self, one: Cause, other: Cause) -> NextRun:
         """The drive on which two causes differ most; a direct measurement where none separates them."""
-        effects = {one.effect, other.effect}
+        pair, c = (one.effect, other.effect), self.evidence.candidates
+        if max(*one.columns, *other.columns) >= c.count:  # nothing tells how it would act on other drives
+            why = f"no drive is planned for these laws of {pair[0]} and {pair[1]}: measure one directly"
+            return NextRun(BY_HAND, pair, 0.0, why)
+        effects = {*pair}
         found = self.forecast(tuple(drives()), effects)
 
         def sigmas(name: str, repeats: int = 1) -> float:
             return self.separation(one, other, repeats * found[name])
 
-        best, pair = max(found, key=sigmas), (one.effect, other.effect)
+        best = max(found, key=sigmas)
         scenario, apart = best, f"{sigmas(best):.1f} sigma"
         enough = [n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS]
         if enough:
@@ -134,7 +138,8 @@ class Planner:
         at, c = np.asarray(true.columns), self.evidence.candidates
         signal = information[:, at] @ true.value
         square = float(true.value @ signal[at])
-        explained = max(_explained(information, signal, h.columns) for h in c.hypotheses if h.effect == other)
+        forms = (h.columns for h in c.hypotheses if h.effect == other and not c.is_composite(h))
+        explained = max(_explained(information, signal, columns) for columns in forms)
         return math.sqrt(max(square - explained, 0.0))
 
     def forecast(self, names: Sequence[str], effects: set[str]) -> dict[str, Array]:
@@ -143,7 +148,7 @@ class Planner:
         for name, run in forecast_runs(self.evidence, names, effects).items():
             out[name] = information = marginalise_run_offsets(score(run, self.sigma).A, self.robot)
             if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
-                keys = self.evidence.candidates.keys
+                keys = self.evidence.candidates.keys[: self.evidence.candidates.count]
                 ground = [i for i, key in enumerate(keys) if key.split("/")[0] in GROUND]
                 information[ground, :] = information[:, ground] = 0.0
         return out

@@ -36,13 +36,14 @@ class Candidates:
     """All candidate effects.
 
     Attributes:
-        keys: parameter keys of the catalogue, one a column.
+        keys: parameter keys of the catalogue, one a column but for the last ones, of composite forms.
         scale, low, high: typical size and range of each, in its unit.
         units: of each.
         hypotheses: the forms, in the order of the catalogue.
         moving: keys that change the robot's motion, sorted as the engine expects them.
         world_fixed: those of `moving` that depend on position or heading in the world.
         base: (K,) the twin's own values, in the parameters' units: a candidate is a change of them.
+        composite: keys of composite forms (`Form.composite`), which have no column.
     """
 
     keys: tuple[str, ...]
@@ -54,6 +55,7 @@ class Candidates:
     moving: tuple[str, ...]
     world_fixed: frozenset[str]
     base: Array
+    composite: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Self:
@@ -79,6 +81,7 @@ class Candidates:
             return present or (form.candidate if wanted is None else form.effect in wanted)
 
         known = {k: v for k, v in parameters().items() if included(v[0])}
+        known = dict(sorted(known.items(), key=lambda one: one[1][0].composite))  # the others in their order
         keys = tuple(known)
         forms = [
             Hypothesis(f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key))
@@ -91,6 +94,7 @@ class Candidates:
             np.array([p.high for p in numbers]), tuple(p.unit for p in numbers), tuple(forms),
             tuple(sorted(key for key in keys if moves(key))),
             frozenset(key for key in keys if known[key][0].world_fixed()), np.zeros(len(keys)),
+            frozenset(key for key in keys if known[key][0].composite),
         )  # fmt: skip
 
     def sized_for(self, vehicle: VehicleParams) -> Self:
@@ -102,6 +106,15 @@ class Candidates:
     def beside(self, effects: Mapping[str, float]) -> Self:
         """As changes of a twin that has these effects already."""
         return replace(self, base=np.array([effects.get(key, 0.0) for key in self.keys]))
+
+    @property
+    def count(self) -> int:
+        """Of columns."""
+        return len(self.keys) - len(self.composite)
+
+    def is_composite(self, law: Hypothesis) -> bool:
+        """Whether a law has no column."""
+        return max(law.columns) >= self.count
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -32,6 +32,7 @@ THRESHOLDS = (0.4, 0.7, 1.0)
 DELAYED = (1.0, 3.0, 8.0)
 """Typical sizes at which a delay on the way to the motors is simulated at once: its sensitivity may be of the
 other sign than what a whole delay does."""
+FIRST_SIZE = 1.0  # typical ones, at which the sensitivity of a composite law is simulated
 
 
 Ladder = tuple[Array, tuple[int, ...]]
@@ -70,15 +71,19 @@ class SignatureBank:
         """All laws that are not linear, by their sensitivity, which costs nothing; insensitive ones and
         delays by rollout, too, unless `simulate` is false."""
         signatures: dict[Hypothesis, dict[float, list[Array]]] = {}
-        candidates, simulated = evidence.candidates, list[SimulatedSize]()
+        candidates, simulated, composite = evidence.candidates, list[SimulatedSize](), list[SimulatedSize]()
         soils = model_soil(evidence)
         columns = [run.by_parameter for run in evidence.runs]
         for law in candidates.hypotheses:
             if not is_simulated(law, candidates):
                 continue
+            low, high = candidates.bounds(law.columns)
+            if candidates.is_composite(law):
+                size = FIRST_SIZE if high.min() >= FIRST_SIZE else -FIRST_SIZE
+                composite.append(SimulatedSize(law, size, soils))
+                continue
             slope = [c[:, law.columns].sum(axis=1) for c in columns]
             square = sum(float(np.square(s).sum()) for s in slope)
-            low, high = candidates.bounds(law.columns)
             signatures[law] = {}
             for end in {float(low.max()), float(high.min())} - {0.0}:
                 if square * end**2 >= INSENSITIVE:
@@ -88,7 +93,18 @@ class SignatureBank:
             if candidates.units[law.columns[0]] == "s" and candidates.keys[law.columns[0]] not in DELAYS:
                 simulated += [SimulatedSize(law, x, soils) for x in DELAYED if x < float(high.max())]
         bank = dataclasses.replace(cls.empty(evidence), signatures=signatures)
-        return bank.with_sizes(evidence, simulated) if simulate else bank
+        return bank.with_sizes(evidence, [*simulated, *composite])._extended(evidence) if simulate else bank
+
+    def _extended(self, evidence: GapEvidence) -> Self:
+        """With composite laws in proportion to their size, up to the ends of their range."""
+        candidates, out = evidence.candidates, dict(self.signatures)
+        for law in filter(candidates.is_composite, self.signatures):
+            ((size, own),) = out[law].items()
+            low, high = candidates.bounds(law.columns)
+            out[law] = {
+                end: [end / size * s for s in own] for end in {float(low.max()), float(high.min())} - {0.0}
+            }
+        return dataclasses.replace(self, signatures=out)
 
     def only(self, laws: Iterable[Hypothesis]) -> Self:
         """With some laws alone."""
@@ -161,6 +177,6 @@ def model_soil(evidence: GapEvidence) -> list[Array]:
 def is_simulated(law: Hypothesis, candidates: Candidates) -> bool:
     """Whether a law needs the twin's rollout at each size."""
     keys = [candidates.keys[i] for i in law.columns]
-    return any(k in candidates.moving or k in DELAYS for k in keys) or (
+    return any(k in candidates.moving or k in DELAYS or k in candidates.composite for k in keys) or (
         len(keys) == 1 and candidates.low[law.columns[0]] == 0.0
     )

@@ -209,10 +209,12 @@ def _blocks(A: Array, spread: Array, candidates: Candidates) -> list[Array]:
     weighted = root[:, None] * weighted
     out = [column[:, None] for column in np.diag(root)]
     for hypothesis in candidates.hypotheses:
+        if candidates.is_composite(hypothesis):
+            continue
         c = list(hypothesis.columns)
         inner = np.linalg.inv(information[np.ix_(c, c)] + np.eye(len(c)) / WIDE**2)
         out.append(weighted[:, c] @ np.linalg.cholesky(inner))
-    nuisance = slice(len(candidates.keys), len(A))
+    nuisance = slice(candidates.count, len(A))
     values, vectors = np.linalg.eigh(information[nuisance, nuisance])
     along, values = weighted[:, nuisance] @ vectors, np.maximum(values, 0.0)
     return out + [along * (size / np.sqrt(1.0 + size**2 * values)) for size in UNKNOWN_SIZES]

@@ -35,6 +35,7 @@ SECOND, GROWTH = 18, 3.0
 WEIGHINGS = 2  # of channels
 LEAST_NORMAL = 0.5  # least mean squared whitened error of references that a channel is compared with
 CLOSE, LEAST_SIZE = 0.02, 0.05  # sizes nearer than this share, or that of typical ones, are not simulated
+SURELY = math.log(20.0)  # log evidence by which a composite law must be ahead of its effect's others
 SAME_SIGNATURE, LEAST_SIGNATURE = 0.97, 3.0
 """Correlation of whole signatures, of so many sigmas at least, from which they differ by a quarter: about as
 much as a law is wrong."""
@@ -138,7 +139,7 @@ class _Explainer:
 
     def outside(self, m: Metric) -> float:
         """Log evidence of a change along the whole nuisance basis."""
-        basis = np.arange(len(self.evidence.candidates.keys), m.shared - self.robot.misfit)
+        basis = np.arange(self.evidence.candidates.count, m.shared - self.robot.misfit)
         values, vectors = np.linalg.eigh(m.K[np.ix_(basis, basis)])
         square = np.square(UNKNOWN_SIZES)[:, None]
         grown = 1.0 + square * np.maximum(values, 0.0)
@@ -227,7 +228,12 @@ def _close_look(
         parts = [metric([r for r in runs if r is not run], own.sigma, own.robot) for run in runs]
         return [laws.fit(part, some).values for part in parts]
 
-    alike = _same_signatures(plain, [found[i,] for i in index])
+    single = [found[i,] for i in index]
+    effects = {fit.laws[0].effect for fit in single}
+    shown = [_shown([f for f in single if f.laws[0].effect == e], laws) for e in effects]
+    # Where one side has changed, it is beside the point what a change of both would resemble.
+    is_composite = laws.candidates.is_composite
+    alike = _same_signatures(plain, [f for f in single if f in shown or not is_composite(*f.laws)])
     every = _by_effect(found, alone, laws, own.outside(look.metric), alike, left_out)
     whole = excess(look.metric)
     left = {effects: min(fit.left / whole, 1.0) for effects, fit in every.fits.items()} if whole else {}
@@ -268,14 +274,21 @@ def _by_effect(
     groups = dict[Sets, list[Fitted]]()
     for some, fit in every.items():
         groups.setdefault(tuple(sorted(laws.names[i].effect for i in some)), []).append(fit)
-    forms = Counter(law.effect for law in laws.names)
+    # One that is composite is as probable as another, and takes nothing from those.
+    forms = Counter(law.effect for law in laws.names if not laws.candidates.is_composite(law))
     evidence = {
         effects: float(np.logaddexp.reduce([fit.evidence for fit in some]))
-        - math.log(math.prod(forms[effect] for effect in effects))
+        - math.log(math.prod(forms[effect] or 1 for effect in effects))
         for effects, some in groups.items()
     }
-    fits = {effects: max(some, key=lambda fit: fit.evidence) for effects, some in groups.items()}
+    fits = {effects: _shown(some, laws) for effects, some in groups.items()}
     return Explanation(evidence, fits, outside, alike, left_out)
+
+
+def _shown(fits: Sequence[Fitted], laws: Laws) -> Fitted:
+    """The most probable; with a composite law, which may claim a side, where the others surely fit less."""
+    claims = [any(map(laws.candidates.is_composite, fit.laws)) for fit in fits]
+    return max(zip(fits, claims, strict=True), key=lambda one: one[0].evidence - SURELY * one[1])[0]
 
 
 def _near(size: float) -> float:

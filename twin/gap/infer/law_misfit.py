@@ -62,7 +62,8 @@ def with_law_misfit(
 def _groups(candidates: Candidates) -> list[list[int]]:
     """Columns of the laws of the ground, of the vehicle and of the sensors."""
     kinds = [
-        0 if key.split("/")[0] in GROUND else 1 if key in candidates.moving else 2 for key in candidates.keys
+        0 if key.split("/")[0] in GROUND else 1 if key in candidates.moving else 2
+        for key in candidates.keys[: candidates.count]
     ]
     return [[i for i, own in enumerate(kinds) if own == kind] for kind in range(3)]
 

@@ -39,6 +39,8 @@ class ReferenceCheck:
 
     def _sensitive(self, law: Hypothesis) -> bool:
         """Whether the robot's offsets hold what references know of the law."""
+        if self.evidence.candidates.is_composite(law):
+            return True
         slopes = [run.by_parameter[:, law.columns].sum(axis=1) for run in self.evidence.references]
         most = np.abs(self.evidence.candidates.bounds(law.columns)).max()
         return sum(float(np.square(most * slope).sum()) for slope in slopes) >= INSENSITIVE

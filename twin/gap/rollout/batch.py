@@ -53,7 +53,7 @@ ABSENT_SHARE = 1e-12
 
 def effect_groups(candidates: Candidates) -> list[tuple[str, ...]]:
     """The nominal twin and the effects that change the motion, by shared graph."""
-    keys = (NOMINAL, *candidates.moving)
+    keys = (NOMINAL, *sorted(candidates.moving, key=lambda key: key in candidates.composite))
     return [keys[first : first + GROUP_SIZE] for first in range(0, len(keys), GROUP_SIZE)]
 
 

@@ -258,7 +258,7 @@ def residuals_from(
 ) -> RunResiduals:
     """Errors and derivatives of a run, from its sensitivities, turned as measured."""
     soil, log = soil_columns(candidates), with_timing(log, [s.value for s in found])
-    error, columns, by_patch, K = [], [], [], len(candidates.keys)
+    error, columns, by_patch, K = [], [], [], candidates.count
     values = [s.value for s in found]
     pairs = zip(log.observed, values, strict=True)
     states = with_heading_errors(log, values, [_sensor_states(o.channel, y, model.vehicle) for o, y in pairs])

@@ -67,7 +67,7 @@ class SoilSearch:
 
     def step(self, candidates: Candidates) -> Array:
         """Step (S,) of the soil; effects and sensor states take part as nuisances."""
-        S, T, K = len(self.soil), self.run.states, len(candidates.keys)
+        S, T, K = len(self.soil), self.run.states, candidates.count
         others = [T + k for k in range(K) if k not in soil_columns(candidates)]
         mine = np.array([*range(T), *others])
         sigma = np.repeat([SOIL_SIGMA, 1.0, EFFECT_SIGMA], [S, T - S, len(others)])

@@ -189,8 +189,8 @@ class Course:
 
     def steps(self, candidates: Candidates) -> dict[str, float]:
         """Step of each parameter, in its unit."""
-        known = self.model.effects
-        return {k: _step(candidates, i, known.get(k, 0.0), self.log) for i, k in enumerate(candidates.keys)}
+        known, keys = self.model.effects, candidates.keys[: candidates.count]
+        return {k: _step(candidates, i, known.get(k, 0.0), self.log) for i, k in enumerate(keys)}
 
     def effects(self, candidates: Candidates) -> dict[str, dict[str, float]]:
         """Effects of each run that is made, by the key that differs."""

@@ -47,7 +47,7 @@ def test_sizes_beyond_a_simulated_one_stay_within_the_range(evidence: GapEvidenc
 
 def test_a_larger_size_to_try_does_not_displace_the_best_one(evidence: GapEvidence) -> None:
     sigma = learn_state_sigma(evidence.references, initial_state_sigma(CANDIDATES))
-    robot = learn_offsets([score(r, sigma) for r in evidence.references], len(CANDIDATES.keys))
+    robot = learn_offsets([score(r, sigma) for r in evidence.references], CANDIDATES.count)
     own = _Explainer(evidence, sigma, robot, ())
     bank = own.with_first_sizes(own.look(SignatureBank.of(evidence)), {0: [0.9 * TOP]})
     np.testing.assert_allclose(bank.sizes(LAW), [-TOP, 0.0, 0.9 * TOP, TOP])

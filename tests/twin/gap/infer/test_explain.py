@@ -24,7 +24,7 @@ def explained(
     given = runs(980, 2, truth), runs(985, 4)
     evidence = gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
     sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
-    robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+    robot = learn_offsets([score(r, sigma) for r in evidence.references], candidates.count)
     return explain(evidence, sigma, robot, close=close), candidates
 
 
@@ -57,6 +57,6 @@ def test_what_references_have_too_is_no_cause() -> None:
     given = runs(980, 2, late), runs(985, 6, late)
     evidence = gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
     sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
-    robot = learn_offsets([score(r, sigma) for r in evidence.references], len(candidates.keys))
+    robot = learn_offsets([score(r, sigma) for r in evidence.references], candidates.count)
     found = explain(evidence, sigma, robot, close=True)
     assert found.evidence[name,] < 0.0

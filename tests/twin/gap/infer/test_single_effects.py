@@ -25,7 +25,7 @@ def law(effect: str, form: str) -> int:
 def problem(seed: int, ladder: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Columns (n, K) of the effects, and signatures (n, 2) of the law with a ladder."""
     rng = np.random.default_rng(seed)
-    columns = rng.standard_normal((ROWS, len(CANDIDATES.keys)))
+    columns = rng.standard_normal((ROWS, CANDIDATES.count))
     return columns, rng.standard_normal((ROWS, 2)) if ladder is None else ladder
 
 
@@ -149,7 +149,7 @@ def test_evidence_is_the_likelihood_times_the_share_of_the_prior(
     candidates = Candidates.of([effect])
     i = next(i for i, h in enumerate(candidates.hypotheses) if h.form == form)
     at = list(candidates.hypotheses[i].columns)
-    columns = np.random.default_rng(8).standard_normal((ROWS, len(candidates.keys)))
+    columns = np.random.default_rng(8).standard_normal((ROWS, candidates.count))
     error = columns[:, at] @ true
     X = np.column_stack([columns, error])
     m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
@@ -168,7 +168,7 @@ def test_each_law_of_a_pair_has_its_own_part_of_the_covariance() -> None:
         next(i for i, h in enumerate(candidates.hypotheses) if h.form == form)
         for form in ("constant", "scale")
     ]
-    columns = np.random.default_rng(8).standard_normal((ROWS, len(candidates.keys)))
+    columns = np.random.default_rng(8).standard_normal((ROWS, candidates.count))
     at = [c for i in pair for c in candidates.hypotheses[i].columns]
     X = np.column_stack([columns, columns[:, at] @ (0.6, 0.8, 0.5)])
     m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
@@ -181,7 +181,7 @@ def test_each_law_of_a_pair_has_its_own_part_of_the_covariance() -> None:
 def test_a_simulated_law_of_two_columns_has_one_size() -> None:
     candidates = Candidates.of(["accel_bias"])
     both = candidates.hypotheses[0]
-    columns, signatures = np.random.default_rng(2).standard_normal((2, ROWS, len(candidates.keys)))
+    columns, signatures = np.random.default_rng(2).standard_normal((2, ROWS, candidates.count))
     X = np.column_stack([columns, signatures[:, :2], 2.0 * signatures[:, 0]])
     m = Metric(np.pad(X.T @ X, (0, 1)), columns.shape[1])
     ladders = {both: (np.array([0.0, 1.0, 3.0]), (-1, 0, 1))}

@@ -36,7 +36,7 @@ def p_values(judged: list[Recording], references: list[Recording]) -> tuple[floa
     """Medians over runs, each judged alone: p of a gap, and the mean squared white error of the yaw rate."""
     found = gathering.gather_evidence(judged, references, load_vehicle("elevate"), None, CANDIDATES, jobs=1)
     sigma = learn_state_sigma(found.references, initial_state_sigma(CANDIDATES))
-    offsets = learn_offsets([score(r, sigma) for r in found.references], len(CANDIDATES.keys))
+    offsets = learn_offsets([score(r, sigma) for r in found.references], CANDIDATES.count)
     yaw = [run.error[run.channel == found.channels.index("yaw_rate_radps")] for run in found.runs]
     p = [detect([score(run, sigma)], offsets, CANDIDATES, 0).p_value for run in found.runs]
     return float(np.median(p)), float(np.median([np.mean(own**2) for own in yaw]))

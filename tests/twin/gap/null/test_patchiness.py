@@ -112,7 +112,7 @@ def p_value() -> tuple[float, gathering.GapEvidence]:
     references = [site(960 + i, 0.1, 2.5) for i in range(5)]
     found = gathering.gather_evidence(judged, references, load_vehicle("elevate"), None, CANDIDATES, jobs=1)
     sigma = learn_state_sigma(found.references, initial_state_sigma(CANDIDATES))
-    offsets = learn_offsets([score(r, sigma) for r in found.references], len(CANDIDATES.keys))
+    offsets = learn_offsets([score(r, sigma) for r in found.references], CANDIDATES.count)
     return detect([score(r, sigma) for r in found.runs], offsets, CANDIDATES, 0).p_value, found
 
 

@@ -35,7 +35,7 @@ def column(shared: Linearisation, key: str) -> np.ndarray:
 def patches(shared: Linearisation, key: str) -> np.ndarray:
     """(n, Y, H) of one parameter, in its unit, by its value at each point of the path."""
     at = list(PATCH_SIGMAS).index(key)
-    own = np.split(shared.columns[:, :, 3 + len(CANDIDATES.keys) :], len(PATCH_SIGMAS), axis=2)[at]
+    own = np.split(shared.columns[:, :, 3 + CANDIDATES.count :], len(PATCH_SIGMAS), axis=2)[at]
     place = STEP_M * np.arange(own.shape[2])
     root = np.linalg.cholesky(np.exp(-np.abs(place[:, None] - place) / LENGTH_M))
     return own @ np.linalg.inv(root) / (PATCH_SIGMAS[key] * CANDIDATES.scale[CANDIDATES.keys.index(key)])
