@@ -98,7 +98,7 @@ FORMATS: tuple[Format, ...] = (
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.sets.norlab_pickle"),
     Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.sets.pathfinder_mat"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.sets.borealtc_csv"),
-    Format("dataflash", "a DataFlash log of ArduPilot (.bin)", f"{_READERS}.dataflash"),
+    Format("dataflash", "a DataFlash log of ArduPilot (.bin)", f"{_READERS}.binary.dataflash"),
     Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.text.xsens_text"),
     Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.text.rtklib_pos"),
     Format("nmea", "an NMEA 0183 log", f"{_READERS}.text.nmea"),
