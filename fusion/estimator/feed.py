@@ -10,7 +10,7 @@ import numpy as np
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.heap import older_objects_unsearched
-from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample
+from terrafusion.datasets.core.messages import ImuSample, MagnetometerSample, Message
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -108,17 +108,21 @@ def feed(
 ) -> np.ndarray:
     """Give an estimator all samples in time order; returns the computing time of each keyframe, ms.
 
-    Keyframes are made as IMU samples come, or, without an IMU or long after its last one, as wheel samples
-    do: what comes after the last of them is left out. `progress` gets the share done, 0 to 1.
+    Keyframes are made as IMU samples come, or, without an IMU or long after the last one of an IMU with which
+    the estimator has started, as wheel samples do: what comes after the last of them is left out. `progress`
+    gets the share done, 0 to 1.
     """
     wheels = wheels_of(recording)
     clock = recording.imu if recording.imu is not None else wheels
-    first_ns, last_ns = int(clock.t_ns[0]), int(clock.t_ns[-1])
-    if wheels.t_ns[-1] - last_ns > BEFORE_PAUSE_NS:
-        last_ns = int(wheels.t_ns[-1])
+    first_ns, last_ns, end_ns = int(clock.t_ns[0]), int(clock.t_ns[-1]), int(wheels.t_ns[-1])
+
+    def counts(message: Message) -> bool:
+        goes_on = end_ns - last_ns > BEFORE_PAUSE_NS and estimator.latest() is not None
+        return message.t_ns <= (end_ns if goes_on else last_ns)
+
     latencies: list[float] = []
     newest = estimator.latest()
-    for message in itertools.takewhile(lambda message: message.t_ns <= last_ns, recording.messages()):
+    for message in itertools.takewhile(counts, recording.messages()):
         begun = time.perf_counter()
         if isinstance(message, ImuSample):  # complete, as `with_usable_samples` leaves them
             estimator.add_imu(*message)
@@ -130,7 +134,7 @@ def feed(
             newest = estimator.latest()
             latencies.append((time.perf_counter() - begun) * 1e3)
             if progress is not None and len(latencies) % 50 == 0:
-                progress((message.t_ns - first_ns) / max(last_ns - first_ns, 1))
+                progress((message.t_ns - first_ns) / max(last_ns - first_ns, end_ns - first_ns, 1))
     estimator.finish()
     if progress is not None:
         progress(1.0)

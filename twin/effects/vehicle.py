@@ -177,12 +177,12 @@ FORMS = (
         "torque limit times exp(-e E / 1 kJ), E drawn so far", "ours: derating",
     ),
     Form(
-        "torque_limit", "weak_motors", one("", 0.2, -0.5, 0.9), {"wheel": _weaker},
+        "torque_limit", "weak_motors", one("", 0.2, 0.0, 0.9), {"wheel": _weaker},
         "the motors' current gives 1 - e of its torque", "worn magnets", composite=True,
     ),
     *(
         Form(
-            "torque_limit", f"weak_{name}", one("", 0.2, -0.5, 0.9), {"wheel": on_side(side, _weaker)},
+            "torque_limit", f"weak_{name}", one("", 0.2, 0.0, 0.9), {"wheel": on_side(side, _weaker)},
             f"the current of the {name} motors gives 1 - e of its torque", "worn magnets", composite=True,
         )
         for name, side in SIDES_BY_NAME.items()

@@ -321,7 +321,9 @@ def wheel_advice(
 ) -> str:
     """A note for a bag without wheels; other sensors have taken the topics `taken`."""
     others = [topic for topic in bag if topic.name not in taken and not _NEVER.search(topic.msgtype)]
-    usable = [t for t in others if t.msgtype in TYPES["wheels"] and not looks_commanded(t.name)]
+    steered = ACKERMANN, ACKERMANN_STAMPED  # which report what they do by the message of their command
+    fit = [topic for topic in others if topic.msgtype in TYPES["wheels"]]
+    usable = [topic for topic in fit if topic.msgtype in steered or not looks_commanded(topic.name)]
     parts = [*_named(usable, joints_of)]
     strange = [topic for topic in others if not any(topic.msgtype in types for types in TYPES.values())]
     strange.sort(key=lambda topic: not _LIKELY.search(f"{topic.name} {topic.msgtype}"))

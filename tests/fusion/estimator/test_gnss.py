@@ -192,7 +192,7 @@ def test_a_stream_sorts_what_comes_late_and_counts_what_comes_too_late() -> None
     assert imu.covers(20_000_000)
     assert not imu.covers(21_000_000)
     imu.late.used_ns = 35_000_000
-    imu.add(32_000_000, np.zeros(3), np.zeros(3))
+    imu.add(32_000_000, np.zeros(3), [0.0, 0.0, 9.8])
     assert imu.late.too_late == 1
     assert len(imu.t_ns) == 5
 
