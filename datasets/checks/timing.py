@@ -30,6 +30,9 @@ GAP_PERIODS, GAP_S = 5.0, 0.2
 MISSING_SHARE = 0.05
 JITTER_SHARE = 0.2
 LEAST_ROWS = 20
+TOGETHER, IN_BURSTS, MOST_BURST = 0.1, 0.8, 100
+"""Intervals within a burst over those between bursts, at most; share of the time that these take, at least;
+most samples of one."""
 FINEST_TICK_S = 0.002
 SAME_SPAN = 0.1
 """Channels whose durations differ by less than this share were recorded together."""
@@ -161,22 +164,36 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
             continue
         period = float(np.median(dt))
         off, steps = np.abs(dt - period) > 0.5 * period, dt / period if period > 0.0 else dt
-        lost = (steps > 1.5) & (np.abs(steps - np.rint(steps)) < 0.1)  # samples are missing, no clock is off
-        share = float((off & ~lost).mean())
-        if share <= JITTER_SHARE:
+        lost = (steps > 1.5) & (steps < GAP_PERIODS) & (np.abs(steps - np.rint(steps)) < 0.1)  # are missing
+        share, burst_s = float((off & ~lost).mean()), _burst_s(dt)
+        if share <= JITTER_SHARE and not burst_s:
             continue
-        mean = float(dt.mean())
+        mean = max(float(dt.mean()), 0.5 * burst_s)
         late = (channel.t_ns - _even(channel.t_ns, GAP_S)) * 1e-9
         regular = len(dt) >= 50 and late.std() < mean and np.abs(late).max() < GAP_PERIODS * mean
         yield Finding(
             "uneven-sampling", "warning", name,
             "uneven sampling",
-            f"{share:.0%} of the intervals are more than half off the median of {period * 1e3:.3g} ms",
+            f"samples come together, {burst_s * 1e3:.3g} ms from the ones to the next"
+            if burst_s
+            else f"{share:.0%} of the intervals are more than half off the median of {period * 1e3:.3g} ms",
             "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
             if regular
             else "use the sensor's own time stamps; the log does not have them",
             changed(name, _evenly_timed) if regular else None,
         )  # fmt: skip
+
+
+def _burst_s(dt: Array) -> float:
+    """Median interval (s) between bursts of samples, as of a port that is read now and then; 0 without."""
+    near = dt[dt <= GAP_S]
+    long = near > near.mean() if len(near) else near > 0.0
+    apart, together = near[long], near[~long]
+    if min(len(apart), len(together)) < LEAST_ROWS or len(apart) * MOST_BURST < len(near):
+        return 0.0
+    burst_s = float(np.median(apart))
+    clear = np.median(together) < TOGETHER * burst_s and apart.sum() > IN_BURSTS * near.sum()
+    return burst_s if clear else 0.0
 
 
 def _without_copies(channel: C) -> C:

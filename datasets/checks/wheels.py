@@ -37,6 +37,13 @@ MOSTLY_BACKWARDS = "they run backwards nearly all the time"
 LEAST_PROGRESS = 0.3
 """Distance covered over distance rolled, if the sides turn the same way, above which it does not spin."""
 
+LEAST_TURN_RADPS, TRACKS, SPINS = 0.15, 60, (0.3, 0.7)
+"""Turns that are judged, and effective tracks tried; how near the sum of the sides must come to a turn, as a
+share of it, and by how much their difference must miss it."""
+LEAST_SPINS, SPIN_SHARE, MOST_LEFT = 10, 0.05, 0.15
+"""Half seconds of spinning, and their share of the turns, at least; what the sum of the sides, where it is
+nearer, may leave of the square error of their difference."""
+
 
 def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
     """Of four wheels, each must run as the other one of its side does."""
@@ -187,6 +194,42 @@ def sides_opposed(context: CheckContext) -> str | None:
     if progress <= LEAST_PROGRESS:
         return None
     return f"by the {source} the robot covers {progress:.0%} of the distance rolled"
+
+
+def check_unsigned(context: CheckContext) -> Iterator[Finding]:
+    """Sides that never run backwards must turn the robot by their difference, not by their sum."""
+    wheels, imu = context.recording.wheels, context.recording.imu
+    if wheels is None or imu is None or not wheels.has_sides() or (wheels.speed < 0.0).any():
+        return
+    left, right = wheels.side_speeds_mps(context.wheel_radius_m() or motion.ANY_RADIUS_M).T
+    start = context.recording.start_ns
+    found = [motion.integral(start, wheels.t_ns, rate) for rate in (right - left, left + right)]
+    gyro = motion.integral(start, imu.t_ns, _vertical_rate(context, imu))
+    if gyro is None or found[0] is None or found[1] is None:
+        return
+    grid = np.arange(*motion.common_span(gyro, found[0]), motion.WINDOW_S)
+    if len(grid) < 2:
+        return
+    turn, apart, together = (angle.rates(grid) for angle in (gyro, *found) if angle is not None)
+    turns = np.abs(turn) > LEAST_TURN_RADPS
+    turn, apart, together = turn[turns], np.abs(apart[turns]), together[turns]
+    track = np.geomspace(LEAST_TRACK_M, WIDEST_TRACK_M, TRACKS)[:, None]
+    by_difference = np.abs(np.abs(turn) - apart / track)
+    by_sum = np.abs(np.abs(turn) - together / track)
+    either = (np.minimum(by_difference, by_sum) ** 2).sum(axis=1)
+    best = int(np.argmin(either))
+    spins = (by_sum[best] < SPINS[0] * np.abs(turn)) & (by_difference[best] > SPINS[1] * np.abs(turn))
+    share = spins.sum() / max(len(turn), 1)
+    if spins.sum() < LEAST_SPINS or share < SPIN_SHARE:
+        return
+    if either[best] > MOST_LEFT * (by_difference**2).sum(axis=1).min():
+        return
+    yield Finding(
+        "wheel-unsigned", "error", "wheels",
+        "the speeds have no sign: no side ever runs backwards",
+        f"in {share:.0%} of the turns the robot spins by the gyro as if the sides ran against each other",
+        "log the direction, too: both channels of the encoder, or the sign of the command of each side",
+    )  # fmt: skip
 
 
 def _vertical_rate(context: CheckContext, imu: Imu) -> Array:

@@ -17,6 +17,7 @@ from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.imu import heading, is_upright
 from terrafusion.datasets.checks.motion import course_agreement, gyro_angle
 from terrafusion.datasets.checks.path import LONGEST_S, antenna, dead_reckoned, path_by
+from terrafusion.datasets.checks.steering import steered_angle
 from terrafusion.datasets.checks.wheels import runs_backwards, sides_opposed, swapped
 from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.conventions import Conventions, apply
@@ -36,6 +37,7 @@ class YawSource(NamedTuple):
 
 
 SOURCES = {
+    "steering": YawSource("the steering", "steering", "steering-sign", "error"),
     "gyro": YawSource("gyro z", "imu", "yaw-sign", "error"),
     "wheels": YawSource("the wheels", "wheels", "wheel-swap", "error"),
     "gnss": YawSource("the path of the fixes", "gnss", "gnss-course", "error"),
@@ -184,7 +186,7 @@ def _agreements(context: CheckContext) -> Agreements:
 @once
 def agreements(context: CheckContext) -> Agreements:
     """Agreement of every pair of yaw sources that can be compared, in the order of `SOURCES`."""
-    known = motion.yaw_angles(context)
+    known = _sources(context)
     found: dict[tuple[str, str], motion.Agreement | None] = {}
     for one, other in combinations(SOURCES, 2):
         if one in known and other in known:
@@ -216,8 +218,14 @@ def contradictors(signs: Signs) -> list[frozenset[str]]:
     return sorted(smallest, key=lambda flipped: [name not in flipped for name in SOURCES])
 
 
+def _sources(context: CheckContext) -> dict[str, motion.Integral]:
+    """Angles turned by all sources but the fixes."""
+    steered = steered_angle(context)
+    return motion.yaw_angles(context) | ({} if steered is None else {"steering": steered})
+
+
 def _signs(context: CheckContext, found: Agreements) -> Signs:
-    known = motion.yaw_angles(context)
+    known = _sources(context)
     signs = {}
     for (a, b), both in found.items():
         delayed = both.r < 0.0 and a in known and b in known and is_delayed(known[a], known[b], both.r)
@@ -279,6 +287,10 @@ def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
         "wheels": ("swap left and right wheels", changed("wheels", swapped)),
         "truth": ("check the truth's frame: its yaw must grow to the left", None),
         "command": ("change the sign of the commanded yaw rate (left turn positive)", command_sign),
+        "steering": (
+            "change the sign of the angles (left positive); are they `rear_rad`, beside a `front_rad` of 0?",
+            scaled("steering", -1.0, "angle_rad"),
+        ),
         "accelerometer": ("check the accelerometer's axes: x, y and z must make a right-handed frame", None),
     }
     return remedies[name]
