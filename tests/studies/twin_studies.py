@@ -38,7 +38,7 @@ TWIN = (
     Study(
         "unseen_gap",
         "Does the diagnosis see and name changes of robots that no part of the library made?",
-        module("unseen_gap.study", "--out", OUT, "--first-seed", "135", "--robots", "2"),
+        module("unseen_gap.study", "--out", OUT, "--first-seed", "142", "--robots", "2"),
         25,
         {
             "alarms": r"false alarms, same drives: (\d+ of \d+)",
