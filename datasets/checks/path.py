@@ -6,6 +6,7 @@ slip, a wrong radius and wrong units.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,9 @@ LEAST_COHERENCE = 0.9
 MOST_BEND_RAD = 0.3
 """Without a gyro the dead-reckoned path is straight: a stretch that bends by so much is 0.4 % longer than its
 chord."""
+SHIFTS, SHIFT_STEPS, SMALL, ALIKE_FIXES = np.array([0.5, 0.5, 0.5]), 5, 1e-3, 10
+"""1 sigma of the antenna's place (m) and of the fixes' delay (s, assumed), steps to find them, steps of
+derivatives, and fixes in a row whose errors are alike."""
 WHEEL_UNITS = (5e-4, 50.0)
 """From speeds in mm/s to speeds mistaken for rates; beyond these the positions have another unit."""
 BENDS = 6.0
@@ -146,7 +150,44 @@ def fit_windows(context: CheckContext, measured: MeasuredPath | None) -> PathFit
     length_m = float(np.clip(SIGMAS * measured.sigma_m, SHORTEST_M, longest_m))
     passed = np.maximum(np.diff(distance) / length_m, np.diff(t) / LONGEST_S)
     window = np.interp(t_fix, t, np.concatenate([[0.0], np.cumsum(passed)])).astype(int)
-    return _fit(context, window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * measured.sigma_m))
+
+    def reckoned_at(shift: Array) -> Complex:
+        """Positions (N,) of the antenna `shift[:2]` further forward and left, as many seconds late."""
+        at = t_fix - shift[2]
+        p = np.interp(at, t, path)
+        return p if yaw is None else p + complex(*shift[:2]) * np.exp(1j * np.interp(at, yaw.t_s, yaw.value))
+
+    yaw, shift = motion.gyro_angle(context.recording), np.zeros(3)
+    if measured.source == "gnss" and yaw is not None:
+        for _ in range(SHIFT_STEPS):
+            p = reckoned_at(shift)
+            columns = [(reckoned_at(shift + step) - p) / SMALL for step in SMALL * np.eye(3)]
+            shift = shift + _shift_left(window, p, columns, g)
+    return _fit(context, window, reckoned_at(shift), g, max(1.0, 3.0 * measured.sigma_m))
+
+
+def _shift_left(window: NDArray[np.int64], p: Complex, columns: Sequence[Complex], g: Complex) -> Array:
+    """By how much a point of the body (forward, left, m) and a delay (s) must change for the path of the
+    fixes, with its derivatives `columns`, each (N,): that of an antenna is longer in turns.
+
+    By least squares beside the fit of each window, from a prior of `SHIFTS`.
+    """
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    n = np.diff(np.append(starts, len(window)))
+
+    def summed(values: Complex) -> Complex:
+        return np.asarray(np.repeat(np.add.reduceat(values, starts), n))
+
+    count = np.repeat(n, n)
+    p, g, *columns = (values - summed(values) / count for values in (p, g, *columns))
+    power = np.maximum(summed(np.abs(p) ** 2).real, 1e-9)
+    factor = summed(np.conj(p) * g) / power
+    coherent = np.abs(factor) * np.sqrt(power) > LEAST_COHERENCE * np.sqrt(summed(np.abs(g) ** 2).real)
+    C = np.array([factor * (column - summed(np.conj(p) * column) / power * p) for column in columns])
+    C, left = C[:, coherent], (g - factor * p)[coherent]
+    noise = float(np.mean(np.abs(left) ** 2)) * ALIKE_FIXES if coherent.any() else 1.0
+    H = (C.conj() @ C.T).real + np.diag(noise / SHIFTS**2 + 1e-12)
+    return np.asarray(np.linalg.solve(H, (C.conj() @ left).real))
 
 
 def _crude_scale(rolled: Array, t_fix: Array, g: Complex) -> float:

@@ -12,7 +12,7 @@ from terrafusion.datasets.checks import scale
 from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.path import PathScale, scales
 from terrafusion.datasets.core.bootstrap import BootstrapInterval
-from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from tests.datasets.conftest import RADIUS_M, make_drive
@@ -58,6 +58,27 @@ def test_without_a_gyro_the_scale_is_that_of_straight_stretches() -> None:
     log = Recording(name="bends", start_ns=0, wheels=wheels, truth=truth)
     ((found, _),) = scales(CheckContext(log, None))
     assert found.ratio == pytest.approx(1.0 / 1.02, rel=2e-3)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+def test_an_antenna_whose_place_is_unknown_does_not_lengthen_the_path(delay_s: float) -> None:
+    """In turns an antenna 2.5 m ahead drives further than the robot: the wheels seemed to read too little."""
+    rng, t_s = np.random.default_rng(0), np.arange(0.0, 300.0, 0.05)
+    yaw = 1.5 * np.sin(2.0 * np.pi * t_s / 20.0) + 0.4 * np.sin(2.0 * np.pi * t_s / 7.0)
+    rate, ahead = np.gradient(yaw, t_s), np.exp(1j * yaw)
+    fix = np.cumsum(ahead) * 0.05 + (2.5 + 0.6j) * ahead + 0.02 * (rng.normal(size=(len(t_s), 2)) @ [1, 1j])
+    t_ns, zero = np.round(t_s * 1e9).astype(np.int64), np.zeros(len(t_s))
+    few = slice(None, None, 4)
+    fixes = Gnss(
+        t_ns[few] + round(delay_s * 1e9), np.column_stack([fix.real, fix.imag, zero])[few],
+        np.full((len(t_s[few]), 3), 0.02), np.full(len(t_s[few]), Fix.FIXED, dtype=np.uint8),
+    )  # fmt: skip
+    imu = Imu(t_ns, np.column_stack([zero, zero, rate]), np.column_stack([zero, rate, zero + 9.81]))
+    wheels = Wheels(t_ns, np.full((len(t_s), 1), 1.0), ("speed",), unit="mps")
+    log = Recording(name="long arm", start_ns=0, wheels=wheels, imu=imu, gnss=fixes)
+    ((found, _),) = scales(CheckContext(log, None))
+    assert found.ratio == pytest.approx(1.0, abs=5e-3)
+    assert found.low < 1.0 < found.high
 
 
 def codes(findings: list[Finding]) -> list[str]:
