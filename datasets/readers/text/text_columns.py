@@ -28,8 +28,8 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import HEAD_BYTES
 from terrafusion.datasets.readers.text.column_map import ColumnMap
+from terrafusion.datasets.readers.text.column_names import UNIT_OF
 from terrafusion.datasets.readers.text.json_lines import is_json_lines, json_table
-from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
