@@ -114,7 +114,8 @@ class MappedColumn:
     """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way.
 
     The numbers of the column, times `scale`, are in the unit. Those of latitudes and longitudes are negative
-    where the column `hemisphere`, "" for none, says S or W.
+    where the column `hemisphere`, "" for none, says S or W. With `increments` they count from
+    row to row.
     """
 
     column: str
@@ -122,6 +123,7 @@ class MappedColumn:
     sign: Annotated[str, Word(("+", "-"))] = "+"
     scale: Annotated[float, _Scale()] = 1.0
     hemisphere: str = ""
+    increments: bool = False
 
     def columns(self) -> list[str]:
         """Names of the columns that hold it."""
@@ -279,6 +281,8 @@ def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple
         yield f"'{here}' is in the unit '{shown(of.unit)}'", remedy
     if of.hemisphere and name not in GEODETIC[:2]:
         yield f"'{here}' has a hemisphere", f"only {' and '.join(GEODETIC[:2])} have one"
+    if of.increments and not (channel == "wheels" and name.endswith("_rad")):
+        yield f"'{here}' has increments", "only angles of wheels come as increments"
     if name in TEXT_FIELDS and of.sign != "+":
         yield f"'{here}' has the sign '-', but is a text", "leave the sign out"
     if name in TEXT_FIELDS and of.scale != 1.0:

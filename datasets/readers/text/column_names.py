@@ -56,6 +56,11 @@ _ROTATION = "w|omega|rpm"
 _TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
 
 
+_INCREMENTS = {"d", "delta", "diff", "inc", "incr", "increment", "increments"}
+_COUNTED = {"tick", "ticks", "count", "counts", "pulse", "pulses", "enc", "encoder"}
+"""Words of counts that begin again with each row."""
+
+
 def _beside(word: str, side: str) -> str:
     """Pattern of a name that holds a word and a side in either order, with or without "wheel"."""
     return rf"(?:{word})_?(?:{side})|(?:wheel_)?(?:{side})_?(?:wheel_)?(?:{word})"
@@ -138,13 +143,14 @@ _MESSAGE = re.compile(
 
 @dataclass(frozen=True)
 class Header:
-    """A column's name, without its unit, in small letters with underscores; the unit, "" for none; and the
-    sensor in front of the name."""
+    """A column's name, without its unit, in small letters with underscores; the unit, "" for none; the sensor
+    in front of the name; and whether an encoder counts from row to row, by its name."""
 
     column: str
     base: str
     unit: str
     sensor: str
+    increments: bool = False
 
 
 def is_time(name: str) -> bool:
@@ -167,12 +173,19 @@ def header_of(name: str) -> Header:
                 break
     if known == "ticks" and not bracketed:
         base = f"{base}_ticks"
+    words = base.split("_")
+    counts = known == "ticks" or not _COUNTED.isdisjoint(words)
+    increments = counts and not _INCREMENTS.isdisjoint(words)
+    if increments:
+        base = "_".join(word for word in words if word not in _INCREMENTS)
     if path := _MESSAGE.fullmatch(base) if re.search(r"[./]", name) and "cmd" not in base else None:
         base = path[1]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
     sensor = re.match(r"(imu|gps|gnss|odom|robot|wheels)_(?=.)", base)
-    return Header(name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "")
+    return Header(
+        name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "", increments
+    )
 
 
 def _guess(header: Header) -> tuple[str, str] | None:

@@ -27,6 +27,8 @@ TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
 GEAR = "1/30"
 """Scale proposed for the speed of motors: nothing in a table tells the gear ratio."""
+TRACK = "track_m: 1"
+"""Proposed beside the yaw rate of an odometry, which it keeps."""
 _OF_FILE = (
     ("gyro", re.compile(r"gyro", re.IGNORECASE)),
     ("acc", re.compile(r"^(?!.*lin).*acc", re.IGNORECASE)),
@@ -120,7 +122,8 @@ def starter_map(
     )
     day = _day(headers, time, cells)
     entry = _time_entry(time, cells.get(time.column, ""), rest, day, step(time.column))
-    return f"time: {entry}, channels: {{{sections}}}"
+    track = f"{TRACK}, " if YAW_RATE in channels.get("wheels", {}) else ""
+    return f"time: {entry}, {track}channels: {{{sections}}}"
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
@@ -154,7 +157,7 @@ def _is_force(header: Header) -> bool:
 def _entry(header: Header, field: str) -> str:
     name = json.dumps(header.column, ensure_ascii=False)
     if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
-        return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
+        return f"{{column: {name}, unit: rev, scale: {TICKS}{', increments: true' * header.increments}}}"
     if field == "fix":
         codes = {"status_status": "navsatfix", "fix_type": "mavlink"}.get(header.base, "nmea")
         return f"{{column: {name}, unit: {codes}}}"

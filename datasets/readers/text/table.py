@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
-from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.channels import Gnss, Wheels
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import DAY_NS, OF_DAY, NotADecimal, dates_to_ns, iso_dates
 from terrafusion.datasets.core.errors import DataError
@@ -40,7 +40,7 @@ from terrafusion.datasets.readers.text.column_map import (
 )
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.json_lines import is_json_lines
-from terrafusion.datasets.readers.text.proposed_map import GEAR, TICKS, left_out, starter_map
+from terrafusion.datasets.readers.text.proposed_map import GEAR, TICKS, TRACK, left_out, starter_map
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
@@ -52,6 +52,8 @@ _OF_HOUR = re.compile(r"\d\d:\d\d\.\d+")
 SHOWN_COLUMNS = 60
 MOST_AT_ONCE = 50
 """So many rows of one time, and no other, are no log."""
+LONG_S = 20.0
+"""No robot that is worth a log stands for so long (assumed)."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -118,6 +120,9 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     else:
         given = ", ".join(filter(None, names))
     open_scales = {TICKS: "how many ticks make a turn?", GEAR: "what is the gear ratio?"}
+    open_scales[TRACK] = "how far apart are the wheels? any distance keeps the yaw rate"
+    if "increments" not in proposal:
+        open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
     unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
     return DataError(
@@ -148,7 +153,8 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
-    notes = [*notes, *time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
+    notes += [*time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
+    notes += _standing_note(channels["wheels"], fields.get("wheels", {}))
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
@@ -249,6 +255,8 @@ def _table(
                 values = _degrees(values, of.column)
             if of.hemisphere:
                 values = values * _signs(columns.texts(of.hemisphere)[order], of.hemisphere)
+            if of.increments:
+                values = np.where(np.isnan(values), np.nan, np.nancumsum(values))
             numbers[name] = values if factor == 1.0 else values * factor
             if of.unit == VARIANCE:  # zero and below: the receiver knows none
                 numbers[name] = np.sqrt(np.where(numbers[name] <= 0.0, np.nan, numbers[name]))
@@ -260,6 +268,17 @@ def _table(
         speed, half = numbers.pop("speed_mps"), 0.5 * track_m * numbers.pop(YAW_RATE)
         numbers |= {"left_mps": speed - half, "right_mps": speed + half}
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
+
+
+def _standing_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn]) -> list[str]:
+    """A note where the angles of wheels, which have no speeds, stay within a turn: increments do."""
+    if wheels is None or wheels.angle_rad is None or not all(name.endswith("_rad") for name in fields):
+        return []
+    range_rad, span_s = float(np.ptp(wheels.angle_rad, axis=0).max()), np.ptp(wheels.t_ns) * 1e-9
+    if range_rad > 2.0 * math.pi or span_s < LONG_S:
+        return []
+    what = f"wheels: no angle leaves a range of {range_rad:.2g} rad in {span_s:.0f} s"
+    return [f"{what}: of counts that begin again with each row, add increments: true to their entries"]
 
 
 def _degrees(values: Array, column: str) -> Array:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 
@@ -190,11 +190,17 @@ def test_variances_of_fixes_are_proposed(end: str, tmp_path: Path) -> None:
 )
 def test_speed_and_yaw_rate_are_the_sides_of_the_odometrys_track(names: str, tmp_path: Path) -> None:
     text = f"{names}\n0,1.0,0.5\n1,2.0,-0.5\n"
-    with pytest.raises(DataError, match=r"wheels: speed and yaw rate need the track; give track_m"):
-        opened_as_proposed(tmp_path, text)
-    wheels = opened_as_proposed(tmp_path, text, track_m=0.6).wheels
+    wheels = opened_as_proposed(tmp_path, text).wheels
+    assert wheels is not None
+    np.testing.assert_allclose(wheels.speed, [[0.75, 1.25], [2.25, 1.75]])
+    columns = tmp_path / "drive.csv.columns.yaml"
+    columns.write_text((proposed := columns.read_text()).replace("track_m: 1,", "track_m: 0.6,"))
+    wheels = open_recording(tmp_path / "drive.csv").wheels
     assert wheels is not None
     np.testing.assert_allclose(wheels.speed, [[0.85, 1.15], [2.15, 1.85]])
+    columns.write_text(proposed.replace("track_m: 1,", ""))
+    with pytest.raises(DataError, match=r"wheels: speed and yaw rate need the track; give track_m"):
+        open_recording(tmp_path / "drive.csv")
 
 
 def test_a_first_line_of_numbers_is_no_header(tmp_path: Path) -> None:
@@ -211,13 +217,37 @@ def test_nanoseconds_beyond_a_second_are_refused(tmp_path: Path) -> None:
         opened_as_proposed(tmp_path, text)
 
 
-def opened_as_proposed(folder: Path, text: str, **keys: float) -> Recording:
+@pytest.mark.parametrize(
+    "names", ["delta_left_ticks,delta_right_ticks", "dEncL,dEncR", "l_enc_inc,r_enc_inc"]
+)
+def test_ticks_of_each_row_are_added_up(names: str, tmp_path: Path) -> None:
+    wheels = opened_as_proposed(tmp_path, f"t,{names}\n0,7,7\n0.1,512,256\n0.2,,\n0.3,512,256\n").wheels
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    np.testing.assert_allclose(np.diff(wheels.angle_rad, axis=0), [[np.pi, np.pi / 2]])
+
+
+def test_ticks_of_each_row_that_are_taken_for_angles_are_noted(tmp_path: Path) -> None:
+    text = "t,left_ticks,right_ticks\n" + "".join(f"{k},{30 + abs(k % 14 - 7)},30\n" for k in range(40))
+    notes = opened_as_proposed(tmp_path, text).notes
+    assert any(
+        "no angle leaves a range of 0.043 rad in 38 s" in note and "increments" in note for note in notes
+    )
+    columns = tmp_path / "drive.csv.columns.yaml"
+    assert "increments" not in columns.read_text()
+    columns.write_text(columns.read_text().replace("1/1024", "1/1024, increments: true"))
+    assert not any("no angle leaves" in note for note in open_recording(tmp_path / "drive.csv").notes)
+    columns.write_text("{time: t, channels: {imu: {gyro_z_radps: {column: left_ticks, increments: true}}}}")
+    with pytest.raises(ConfigError, match="only angles of wheels come as increments"):
+        open_recording(tmp_path / "drive.csv")
+
+
+def opened_as_proposed(folder: Path, text: str) -> Recording:
     """A table, opened by the map that the error without one proposes."""
     path = folder / "drive.csv"
     path.write_text(text)
     (columns := folder / "drive.csv.columns.yaml").unlink(missing_ok=True)
     with pytest.raises(DataError) as told:
         open_recording(path)
-    given = "".join(f"{key}: {value}, " for key, value in keys.items())
-    columns.write_text("{" + given + str(told.value).split(".columns.yaml: {", 1)[1])
+    columns.write_text("{" + str(told.value).split(".columns.yaml: {", 1)[1])
     return open_recording(path)
