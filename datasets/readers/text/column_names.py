@@ -1,6 +1,7 @@
 """What the name of a table's column tells: its unit, its sensor, and the field it may stand for."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, YAW_RATE, units_of
@@ -135,22 +136,33 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 _LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
 """Names of a horizontal accuracy, which stands for the sigma of both axes."""
 _MESSAGE = re.compile(
-    r"(?:.*_)?(angular_velocity_[xyz]|linear_acceleration_[xyz]|twist_(?:linear_x|angular_z)"
+    r"(.*_)?(angular_velocity_[xyz]|linear_acceleration_[xyz]|twist_(?:linear_x|angular_z)"
     r"|latitude|longitude|altitude|status_status|header_stamp|position_covariance_?[048])"
 )
 """Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
 
 
+_FUSED = re.compile(r"filter|fused|ekf|ukf|slam|visual|camera|lidar|locali[sz]|amcl")
+"""Topics of estimates, which are no odometry of wheels."""
+_SENSOR = re.compile(
+    r"(?:((?:front|rear|back|left|right|top|base|body|main|second(?:ary)?|primary)_)(?=imu|gps|gnss))?"
+    r"(imu|gps|gnss|odom|robot|wheels)(_?\d+)?_(?=.)"
+)
+"""A sensor in front of the name of its column, and which of several it is."""
+
+
 @dataclass(frozen=True)
 class Header:
     """A column's name, without its unit, in small letters with underscores; the unit, "" for none; the sensor
-    in front of the name; and whether an encoder counts from row to row, by its name."""
+    in front of the name; whether an encoder counts from row to row, by its name; and which of several sensors
+    the name tells, "" for none."""
 
     column: str
     base: str
     unit: str
     sensor: str
     increments: bool = False
+    device: str = ""
 
 
 def is_time(name: str) -> bool:
@@ -178,14 +190,15 @@ def header_of(name: str) -> Header:
     increments = counts and not _INCREMENTS.isdisjoint(words)
     if increments:
         base = "_".join(word for word in words if word not in _INCREMENTS)
+    device = ""
     if path := _MESSAGE.fullmatch(base) if re.search(r"[./]", name) and "cmd" not in base else None:
-        base = path[1]
+        device, base = path[1] or "", path[2]
     if not known and "rpm" in base.split("_"):  # rpm_left
         known = "rpm"
-    sensor = re.match(r"(imu|gps|gnss|odom|robot|wheels)_(?=.)", base)
-    return Header(
-        name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "", increments
-    )
+    sensor = _SENSOR.match(base)
+    if sensor:
+        base, device = base[sensor.end() :], f"{sensor[1] or ''}{(sensor[3] or '').strip('_')}"
+    return Header(name, base, known, sensor[2] if sensor else "", increments, device)
 
 
 def _guess(header: Header) -> tuple[str, str] | None:
@@ -195,7 +208,8 @@ def _guess(header: Header) -> tuple[str, str] | None:
         if own and channel in ("imu", "wheels", "gnss", "motor", "steering"):
             return channel, header.column
     for pattern, channel, fields in _PATTERNS:
-        if _OWNER.get(header.sensor, channel) != channel or not re.fullmatch(pattern, header.base):
+        fused = channel == "wheels" and _FUSED.search(header.device)
+        if fused or _OWNER.get(header.sensor, channel) != channel or not re.fullmatch(pattern, header.base):
             continue
         for field in fields:
             fits = not header.unit or header.unit in units_of(field)
@@ -211,3 +225,18 @@ def guesses(header: Header) -> list[tuple[str, str]]:
     if header.base == "fix_type" and not header.column.endswith(header.base):
         return []  # u-blox's fixType has other codes
     return [] if (guess := _guess(header)) is None else [guess]
+
+
+def of_each(headers: Sequence[Header], channel: str) -> dict[str, list[str]]:
+    """The columns of sensors that give the same field of a channel, by the sensor; {} where one does."""
+    by_field: dict[str, set[str]] = {}
+    for header in headers:
+        for owner, field in guesses(header):
+            if owner == channel:
+                by_field.setdefault(field, set()).add(header.device)
+    alike = set().union(*(devices for devices in by_field.values() if len(devices) > 1))
+    found: dict[str, list[str]] = {}
+    for header in headers:
+        if header.device in alike and any(owner == channel for owner, _ in guesses(header)):
+            found.setdefault(header.device, []).append(header.column)
+    return found

@@ -21,6 +21,7 @@ from terrafusion.datasets.readers.text.column_names import (
     Header,
     guesses,
     header_of,
+    of_each,
 )
 
 TICKS = "1/1024"
@@ -94,6 +95,8 @@ def starter_map(
     time = next((h for h in times if h.base == "header_stamp"), [*of_day, *times, headers[0]][0])
     rest = _nanoseconds(time.column, names)
     channels: dict[str, dict[str, str]] = {}
+    others = {name for several in second_sensors(headers).values() for name in several}
+    headers = [header for header in headers if header.column not in others]
     for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
         if header.column in (time.column, rest):
             continue
@@ -124,6 +127,16 @@ def starter_map(
     entry = _time_entry(time, cells.get(time.column, ""), rest, day, step(time.column))
     track = f"{TRACK}, " if YAW_RATE in channels.get("wheels", {}) else ""
     return f"time: {entry}, {track}channels: {{{sections}}}"
+
+
+def second_sensors(headers: Sequence[Header]) -> dict[str, list[str]]:
+    """Columns of all but the first of several sensors alike, by the first column of the first."""
+    found = {}
+    for channel in ("imu", "gnss", "wheels"):
+        first, *rest = [*of_each(headers, channel).values()] or [[]]
+        if rest:
+            found[first[0]] = [name for names in rest for name in names]
+    return found
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:

@@ -38,9 +38,17 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
     units_of,
 )
+from terrafusion.datasets.readers.text.column_names import header_of
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.json_lines import is_json_lines
-from terrafusion.datasets.readers.text.proposed_map import GEAR, TICKS, TRACK, left_out, starter_map
+from terrafusion.datasets.readers.text.proposed_map import (
+    GEAR,
+    TICKS,
+    TRACK,
+    left_out,
+    second_sensors,
+    starter_map,
+)
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
@@ -124,6 +132,10 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     if "increments" not in proposal:
         open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
+    for taken, left in second_sensors([header_of(name) for name in names]).items():
+        ask += (
+            f" (of several sensors it takes that of {taken}: for another write its columns, {left[0]}, ...)"
+        )
     unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
     return DataError(
         f"nothing says what the columns {given} are",

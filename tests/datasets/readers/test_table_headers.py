@@ -340,3 +340,26 @@ def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:
     names = ["t", "lat", "lon", "fix_type"]
     assert "mavlink" in starter_map(names, ["0", "48.1", "11.5", "6"])
     assert "fix" not in starter_map(names, ["0", "48.1", "11.5", "RTK_FIXED"])
+
+
+@pytest.mark.parametrize(
+    ("taken", "others"),
+    [
+        ("imu1_gz,imu1_ax", "imu2_gz,imu2_ax"),
+        ("imu_2_ax,imu2_gz", "imu_1_gz"),
+        ("rear_imu_gyro_z", "front_imu_gyro_z,front_imu_acc_z"),
+        ("/imu/angular_velocity/z,/imu/linear_acceleration/x", "/b/angular_velocity/z"),
+        ("gps1_lat,gps1_lon", "gps2_lat,gps2_lon,gps2_alt"),
+        ("/odom/twist/twist/linear/x", "/odometry/filtered/twist/twist/linear/x"),
+        ("gps_lat,gps_lon,gnss_hacc,imu_gz,acc_x", ""),
+    ],
+)
+def test_of_several_sensors_the_first_is_proposed_and_said(taken: str, others: str, tmp_path: Path) -> None:
+    columns = ",".join(filter(None, (taken, others)))
+    (path := tmp_path / "drive.csv").write_text(f"t,{columns}\n0{',1' * len(columns.split(','))}\n")
+    with pytest.raises(DataError) as refused:
+        open_recording(path)
+    said, _, proposal = str(refused.value).partition(".columns.yaml: ")
+    assert [name for name in columns.split(",") if f'"{name}"' in proposal] == taken.split(",")
+    assert (f"leaves out {others.replace(',', ', ')} (" in said) == bool(others)
+    assert ("of several sensors it takes that of" in said) == (others != "" and "filtered" not in others)
