@@ -56,13 +56,14 @@ def units_of(field: str) -> dict[str, float]:
 
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
+ECEF = ("ecef_x_m", "ecef_y_m", "ecef_z_m")
 FIELDS = {channel: (*columns.numbers, *columns.texts) for channel, columns in COLUMNS.items()}
-FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"])
+FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"], *ECEF)
 FIELDS["truth"] = (*FIELDS["truth"][:3], "yaw_rad", *FIELDS["truth"][3:])
 YAW_RATE = "yaw_rate_radps"
 FIELDS["wheels"] = (*FIELDS["wheels"], YAW_RATE)
-"""Fields of each channel: the columns of the log folder, latitude and longitude, a plain yaw, and the yaw
-rate of wheel odometry beside its speed. `terrain` also takes p_<class>."""
+"""Fields of each channel: the columns of the log folder, latitude and longitude, ECEF, a plain yaw, and the
+yaw rate of wheel odometry beside its speed. `terrain` also takes p_<class>."""
 
 TEXT_FIELDS = ("fix", "label")
 FIX_CODES = ("", *FIX_OF_CODE)
@@ -260,11 +261,10 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
             yield from _field_problems(channel, name, of)
         if YAW_RATE in fields and {*fields} != {YAW_RATE, "speed_mps"}:
             yield f"'wheels' has {', '.join(fields)}", f"{YAW_RATE} stands beside speed_mps alone"
-        if channel == "gnss" and bool({"east_m", "north_m"} & set(fields)) == ("latitude_deg" in fields):
-            yield (
-                "'gnss' has no position, or two",
-                "give either latitude_deg and longitude_deg or east_m and north_m",
-            )
+        positions = (GEODETIC[:2], ("east_m", "north_m"), ECEF)
+        if channel == "gnss" and sum(bool({*fields} & {*one}) for one in positions) != 1:
+            remedy = f"give one of: {' | '.join(map(', '.join, positions))}"
+            yield "'gnss' has no position, or two", remedy
 
 
 def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple[str, str]]:

@@ -77,6 +77,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
     (r"up", "gnss", ("up_m",)),
+    *((rf"(?:pos(?:ition)?_)?ecef_?(?:pos_)?{a}|{a}_?ecef", "gnss", (f"ecef_{a}_m",)) for a in "xyz"),
     *(
         (
             rf"{word}|{word}ing|{a}|utm_?(?:{a}|{xy}|{word}|{word}ing)|(?:{a}|{xy})_?utm",

@@ -10,7 +10,7 @@ import numpy as np
 from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import DDMM, VARIANCE, YAW_RATE, units_of
+from terrafusion.datasets.readers.text.column_map import DDMM, ECEF, VARIANCE, YAW_RATE, units_of
 from terrafusion.datasets.readers.text.column_names import (
     OF_WEEK,
     SIDES,
@@ -46,18 +46,24 @@ _LONGEST_STEP_S = 2.0
 """Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_NEAR_GROUND_M = (6.3e6, 6.4e6)
+"""Distances of ground robots from the centre of the Earth: x, y, z are ECEF."""
+_TURN_RAD = 6.3
+"""Headings beyond are in degrees."""
 _HEMISPHERES = {"latitude_deg": ("N", "S"), "longitude_deg": ("E", "W")}
 _NMEA_PLACE = re.compile(r"-?\d{4,5}\.\d+")
 """A latitude or longitude in degrees and minutes; with zeros in front of small ones."""
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
+    ("gnss", ("ecef_x_m", "ecef_z_m")),
+    ("gnss", ("ecef_x_m", "ecef_y_m")),
     ("gnss", ("v_e_mps", "v_n_mps")),
     ("motor", ("left_a", "right_a")),
     ("motor", ("left_v", "right_v")),
     ("truth", ("x_m", "y_m")),
 )
-_NEEDED = {"gnss": ("latitude_deg", "east_m"), "truth": ("x_m",), "motor": ("left_a",)}
+_NEEDED = {"gnss": ("latitude_deg", "east_m", "ecef_x_m"), "truth": ("x_m",), "motor": ("left_a",)}
 """One of these must be there."""
 _WHEELS = tuple(
     tuple(f"{side}_{unit}" for side in sides)
@@ -72,16 +78,19 @@ def starter_map(
     units: Sequence[str] = (),
     *,
     of_file: str = "",
-    step: Callable[[str], float] = lambda name: 0.0,
+    sample: Callable[[str], Sequence[float]] = lambda name: (),
 ) -> str:
     """A first column map, on one line, for the user to correct.
 
-    The first row's cells tell units, as do those of a line of `units` below the header and the median `step`
-    of a column; the name `of_file` tells the sensor of columns x, y, z.
+    The first row's cells tell units, as do those of a line of `units` below the header and the numbers in a
+    `sample` of a column; the name `of_file` tells the sensor of columns x, y, z.
     """
     headers = [header_of(name) for name in names]
     if {"x", "y", "z"} <= {h.base for h in headers}:
         sensor = next((word for word, name in _OF_FILE if name.search(of_file)), "")
+        xyz = [n for h in headers if h.base in ("x", "y", "z") for n in sample(h.column)[:1]]
+        if _NEAR_GROUND_M[0] < np.linalg.norm(xyz) < _NEAR_GROUND_M[1]:
+            sensor = "ecef"
         headers = [
             replace(h, base=f"{sensor}_{h.base}") if sensor and h.base in "xyz" else h for h in headers
         ]
@@ -103,6 +112,10 @@ def starter_map(
         for channel, field in guesses(header):
             if field == "fix" and number_in(cells.get(header.column, "") or "0") is None:
                 continue  # words, which may be none of the classes
+            if field == "yaw_rad" and max(map(abs, sample(header.column)), default=0.0) > _TURN_RAD:
+                header = replace(header, unit="deg")
+            if field == "yaw_rad" and (header.base, header.unit) == ("heading", "deg"):
+                continue  # of a compass, mostly
             if field not in channels.get(channel, {}):
                 if _COUNTER.search(header.base) and _WHOLE.fullmatch(cells.get(header.column, "")):
                     header = replace(header, unit=header.unit or "ticks")
@@ -124,7 +137,7 @@ def starter_map(
         for channel, fields in channels.items()
     )
     day = _day(headers, time, cells)
-    entry = _time_entry(time, cells.get(time.column, ""), rest, day, step(time.column))
+    entry = _time_entry(time, cells.get(time.column, ""), rest, day, sample(time.column))
     track = f"{TRACK}, " if YAW_RATE in channels.get("wheels", {}) else ""
     return f"time: {entry}, {track}channels: {{{sections}}}"
 
@@ -218,7 +231,8 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     elif "front_rad" not in steering:
         steering.pop("rear_rad", None)
     if "latitude_deg" in gnss:
-        found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
+        local = ("east_m", "north_m", "up_m", *ECEF)
+        found["gnss"] = {name: entry for name, entry in gnss.items() if name not in local}
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
     one = {name: wheels[name] for name in ("speed_mps", YAW_RATE) if "speed_mps" in wheels and name in wheels}
     found["wheels"] = {name: wheels[name] for name in layout} or one
@@ -251,7 +265,7 @@ def _day(headers: Sequence[Header], time: Header, cells: Mapping[str, str]) -> s
     return known[0] if known and _cell_of_day(time, cells) else ""
 
 
-def _time_entry(time: Header, cell: str, rest: str, day: str, step: float) -> str:
+def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[float]) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit or UNIT_OF.get(time.base, ""), "unix"
     unit = unit if unit in TIME_UNITS else ""
@@ -266,6 +280,7 @@ def _time_entry(time: Header, cell: str, rest: str, day: str, step: float) -> st
         return f"{{column: {name}, unit: {unit}{since or ', epoch: none'}}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
     unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "")
+    step = float(np.median(np.diff(sample))) if len(sample) > 1 else 0.0
     if not unit and abs(value) < 0.1 * size["s"] and step == round(step):
         unit = next((known for known in TIME_UNITS if step <= _LONGEST_STEP_S * size[known] * 1e-9), "")
     unit = unit or "s"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import pymap3d
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
@@ -26,6 +27,7 @@ from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Requ
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
     DDMM,
+    ECEF,
     EPOCHS,
     GEODETIC,
     TEXT_FIELDS,
@@ -62,6 +64,8 @@ MOST_AT_ONCE = 50
 """So many rows of one time, and no other, are no log."""
 LONG_S = 20.0
 """No robot that is worth a log stands for so long (assumed)."""
+EARTH_M, FAR_M = 6.37e6, 1e5
+"""Mean radius of the Earth, and how far from it a ground robot is at most."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -121,7 +125,7 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
         return DataError(what, remedy=f"export one column for each '{signal}', and one of time")
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
-    proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)
+    proposal = starter_map(names, first, columns.units, of_file=path.stem, sample=columns.sample)
     if names == numbered(len(names)):
         proposal = f"header: none, {proposal}"
         given = f"{', '.join(names)} (first row: {', '.join(first)})"
@@ -303,6 +307,22 @@ def _degrees(values: Array, column: str) -> Array:
     return degrees + minutes / 60.0
 
 
+def _geodetic(ecef_m: Array) -> Array:
+    """Latitude (deg), longitude (deg) and height (m) above the ellipsoid (N, 3) of ECEF positions (N, 3).
+
+    NaN where a receiver writes zeros for no position.
+
+    Raises:
+        DataError: a position that is not within 100 km of the ground.
+    """
+    ecef_m = np.where((ecef_m == 0.0).all(axis=1)[:, None], np.nan, ecef_m)
+    radius_m = np.linalg.norm(ecef_m, axis=1)
+    if (far := np.abs(radius_m - EARTH_M) > FAR_M).any():
+        what = f"is {radius_m[far][0]:.4g} m from the centre of the Earth by {', '.join(ECEF)}"
+        raise DataError(what, channel="gnss", remedy="correct the units, or map east_m and north_m")
+    return np.stack(pymap3d.ecef2geodetic(*ecef_m.T), axis=1)
+
+
 def _signs(letters: NDArray[Any], column: str) -> Array:
     """Signs (N,) of hemispheres, NaN where there is none."""
     signs = {"N": 1.0, "E": 1.0, "S": -1.0, "W": -1.0} | dict.fromkeys(MISSING, math.nan)
@@ -336,16 +356,20 @@ class _Reader(ChannelReader):
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}
 
     def _gnss(self, table: TimedTable) -> Gnss | None:
-        for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
-            if (a in table.numbers) != (b in table.numbers):
-                raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
-        local = "latitude_deg" not in table.numbers
+        for every in (GEODETIC[:2], ("east_m", "north_m"), ECEF):
+            if 0 < len(present := [name for name in every if name in table.numbers]) < len(every):
+                what = f"has only {', '.join(present)} of {', '.join(every)}"
+                raise DataError(what, channel="gnss", remedy="give all")
+        local = "east_m" in table.numbers
+        position = table.stack(("east_m", "north_m", "up_m") if local else GEODETIC)
+        if ECEF[0] in table.numbers:
+            position = _geodetic(table.stack(ECEF))
         sigma = table.stack(GNSS_SIGMA)
         if "sigma_e_m" in table.numbers and "sigma_u_m" not in table.numbers:
             sigma[:, 2] = UP_FACTOR * sigma[:, :2].max(axis=1)
         fixes = Fixes(
             self._t(table),
-            table.stack(("east_m", "north_m", "up_m") if local else GEODETIC),
+            position,
             self._fix(table),
             sigma,
             table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None,

@@ -87,12 +87,11 @@ class TextColumns:
         columns = range(len(self.names)) if rows else ()
         return [next((r[k] for r in rows if k < len(r) and r[k] not in MISSING), "") for k in columns]
 
-    def step(self, name: str) -> float:
-        """Median step of a column over the first rows; 0 where it holds no numbers."""
+    def sample(self, name: str) -> list[float]:
+        """The numbers of a column in the first rows."""
         k = self.names.index(name)
         cells = [number_in(row[k]) for row in _sample(self._text, self._layout) if len(row) > k]
-        values = [cell for cell in cells if cell is not None]
-        return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+        return [cell for cell in cells if cell is not None]
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
@@ -264,9 +263,9 @@ class ParquetColumns:
         """None: the kinds of the columns say what they hold."""
         return []
 
-    def step(self, name: str) -> float:
-        """0: the kinds of the columns say what they hold."""
-        return 0.0
+    def sample(self, name: str) -> list[float]:
+        """None: the kinds of the columns say what they hold."""
+        return []
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""

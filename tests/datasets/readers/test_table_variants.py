@@ -7,6 +7,7 @@ from operator import xor
 from pathlib import Path
 
 import numpy as np
+import pymap3d
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
@@ -240,6 +241,41 @@ def test_ticks_of_each_row_that_are_taken_for_angles_are_noted(tmp_path: Path) -
     columns.write_text("{time: t, channels: {imu: {gyro_z_radps: {column: left_ticks, increments: true}}}}")
     with pytest.raises(ConfigError, match="only angles of wheels come as increments"):
         open_recording(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize("names", ["ecef_x,ecef_y,ecef_z", "ecefX [cm],ecefY [cm],ecefZ [cm]", "x,y,z"])
+def test_earth_centred_positions_are_fixes(names: str, tmp_path: Path) -> None:
+    """Of a table of x, y, z they were the truth of a robot 6 000 km from its origin."""
+    scale = 100.0 if "cm" in names else 1.0
+    places = [pymap3d.geodetic2ecef(48.1, 11.5 + 1e-4 * k, 500.0) for k in range(3)]
+    rows = "".join(
+        f"{k},{','.join(f'{value * scale:.3f}' for value in one)}\n" for k, one in enumerate(places)
+    )
+    recording = opened_as_proposed(tmp_path, f"t,{names}\n{rows}3,0,0,0\n")
+    assert recording.truth is None
+    assert recording.gnss is not None
+    east = [pymap3d.geodetic2enu(48.1, 11.5 + 1e-4 * k, 500.0, 48.1, 11.5, 500.0)[0] for k in range(3)]
+    np.testing.assert_allclose(recording.gnss.enu_m[:, 0], east, atol=2e-3)
+    assert recording.datum == pytest.approx((48.1, 11.5, 500.0), abs=1e-2)
+    columns = tmp_path / "drive.csv.columns.yaml"
+    columns.write_text(columns.read_text().replace("unit: cm", "unit: m"))
+    if "cm" in names:
+        with pytest.raises(DataError, match=r"6\.3\d+e\+08 m from the centre of the Earth by ecef_x_m"):
+            open_recording(tmp_path / "drive.csv")
+
+
+def test_headings_in_degrees_are_no_yaw_in_radians(tmp_path: Path) -> None:
+    """A heading in degrees is a compass's, clockwise from north; the yaw of a pose keeps its sense."""
+    rows = "0,0,0,{0}\n1,1,0,{1}\n"
+    truth = opened_as_proposed(tmp_path, "t,x,y,yaw\n" + rows.format(90, 45)).truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.quaternion, [[0, 0, 0.5**0.5, 0.5**0.5], [0, 0, 0.38268343, 0.92387953]])
+    truth = opened_as_proposed(tmp_path, "t,x,y,heading\n" + rows.format(1.5, 1.6)).truth
+    assert truth is not None
+    assert truth.quaternion is not None
+    truth = opened_as_proposed(tmp_path, "t,x,y,heading\n" + rows.format(350.0, 3.0)).truth
+    assert truth is not None
+    assert truth.quaternion is None
 
 
 def opened_as_proposed(folder: Path, text: str) -> Recording:
