@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Gnss, Wheels
 from terrafusion.datasets.core.conventions import apply
-from terrafusion.datasets.core.decimals import DAY_NS, OF_DAY, NotADecimal, dates_to_ns, iso_dates
+from terrafusion.datasets.core.decimals import (
+    DAY_NS,
+    OF_DAY,
+    NotADecimal,
+    dates_to_ns,
+    iso_dates,
+    month_is_assumed,
+)
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
@@ -243,7 +250,10 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
         ) from None
     if not of_day:
         zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", plain[0])
-        return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
+        notes = [] if zoned else ["times without an offset are taken as UTC"]
+        if month_is_assumed(texts):
+            notes += [f"the month is taken first in dates such as {texts[0][:40]}, as beside AM and PM"]
+        return t_ns, notes
     steps = np.diff(t_ns, prepend=t_ns[:1])
     t_ns = t_ns + turn_ns * np.cumsum((steps < -turn_ns // 2).astype(np.int64) - (steps > turn_ns // 2))
     if time.epoch in EPOCHS:

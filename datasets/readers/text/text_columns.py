@@ -38,6 +38,8 @@ PREFACE_LINES = 60
 """So many lines may stand in front of a header."""
 _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 """What may stand in front of a header for Excel."""
+_THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?")
+_QUOTED_COMMA = re.compile(rb'"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)"')
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
@@ -73,7 +75,7 @@ class TextColumns:
         numbers = [name for name in column_map.columns() if name not in texts]
         self._table = read_columns(self.path, self._text, self._layout, numbers, sorted(texts))
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
-        self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
+        self.notes = [*self._table.notes, *([self._commas] if self._commas else [])]
         self.notes += [again] if self._repeated else []
         self.notes += [f"{counted(self._timeless, 'line')} without a time left out"] if self._timeless else []
         self.notes += (
@@ -179,15 +181,31 @@ def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
             yield split(line, layout.separator)
 
 
-def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
-    """The text with points for decimal commas, and whether it had any: no cell may have a decimal point."""
-    if layout.separator == ",":
-        return data, False
-    cells = [cell for row in _sample(data, layout) for cell in row]
-    if not any(map(_COMMA.fullmatch, cells)) or any(map(_POINT.fullmatch, cells)):
-        return data, False
+def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, str]:
+    """The text with points for decimal commas, or without commas between thousands, and a note of that.
+
+    Commas are decimal where no cell has a point; between commas as separators, numbers have them in quotes.
+    """
+    quoted = layout.separator == ","
     begin = _begin(data, layout.first_line)
-    return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
+    head, rows = data[:begin], data[begin:]
+    if b"," not in rows or (quoted and b'"' not in rows):
+        return data, ""
+    cells = [cell for row in _sample(data, layout) for cell in row]
+    points = any(map(_POINT.fullmatch, cells))
+    commas = [cell for cell in cells if _COMMA.fullmatch(cell)]
+    fractions = [cell for cell in commas if not _THOUSANDS.fullmatch(cell.encode())]
+    if commas and not points and (fractions or not quoted):
+        rows = _QUOTED_COMMA.sub(rb"\1.\2", rows) if quoted else rows.replace(b",", b".")
+        return type(data)(head + rows), "numbers have decimal commas"
+    mark = b"" if layout.separator == BLANKS else re.escape(layout.separator.encode())
+    before, after = (b'(?<=")', b'(?=")') if quoted else (b"(?<![^\\s%b])" % mark, b"(?![^\\s%b])" % mark)
+    grouped = re.compile(before + _THOUSANDS.pattern + after)
+    found = grouped.findall(rows)
+    if fractions or not (points or any(b"." in one or one.count(b",") > 1 for one in found)):
+        return data, ""
+    rows, count = grouped.subn(lambda cell: cell[0].replace(b",", b""), rows)
+    return type(data)(head + rows), "numbers have commas between thousands" if count else ""
 
 
 def _units_below(data: bytes, layout: TextLayout) -> tuple[list[str], int]:

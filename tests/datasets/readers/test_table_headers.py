@@ -363,3 +363,27 @@ def test_of_several_sensors_the_first_is_proposed_and_said(taken: str, others: s
     assert [name for name in columns.split(",") if f'"{name}"' in proposal] == taken.split(",")
     assert (f"leaves out {others.replace(',', ', ')} (" in said) == bool(others)
     assert ("of several sensors it takes that of" in said) == (others != "" and "filtered" not in others)
+
+
+@pytest.mark.parametrize(
+    ("text", "rpm", "said"),
+    [
+        ('t,gz,left_rpm,right_rpm\n0,1,999.5,"1,999.5"\n1,234,567,"1,000"\n', [999.5, 1999.5], "thousands"),
+        ('t,gz,left_rpm,right_rpm\n0,1,"-1,234,567",2\n', [-1234567, 2], "thousands"),
+        ("t;gz;left_rpm;right_rpm\n0;1;999.5;1,999.5\n1;2; 3,000;4\n", [999.5, 1999.5], "thousands"),
+        ('t,gz,left_rpm,right_rpm\n0,"1,5","0,25","1,125"\n', [0.25, 1.125], "decimal commas"),
+        ("t;gz;left_rpm;right_rpm\n0;1;2,125;1,125\n", [2.125, 1.125], "decimal commas"),
+    ],
+)
+def test_commas_between_thousands_or_for_points(
+    text: str, rpm: list[float], said: str, tmp_path: Path
+) -> None:
+    found = proposed(tmp_path, text)
+    assert found.wheels is not None
+    np.testing.assert_allclose(found.wheels.speed[0], np.pi / 30.0 * np.array(rpm))
+    assert sum(said in note for note in found.notes) == 1
+
+
+def test_a_comma_that_may_be_either_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"column 'right_rpm' is '1,125' at line 2"):
+        proposed(tmp_path, 't,gz,left_rpm,right_rpm\n0,1,2,"1,125"\n')

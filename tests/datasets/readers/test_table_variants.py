@@ -155,6 +155,15 @@ def test_a_date_that_is_not_clear_is_refused(date: str, tmp_path: Path) -> None:
         opened_as_proposed(tmp_path, f"time,gyro_z\n{date},1\n")
 
 
+@pytest.mark.parametrize("date", ["05/01/2024 12:00:00.5 PM", "5/1/2024 12:00 pm", "4/30/2024 12:00:00.5 PM"])
+def test_the_month_is_first_beside_am_and_pm_and_that_is_said(date: str, tmp_path: Path) -> None:
+    found = opened_as_proposed(tmp_path, f"time,gyro_z\n{date},1\n")
+    clear = "30" in date
+    day = "2024-04-30" if clear else "2024-05-01"
+    assert found.start_ns // 10**9 == np.datetime64(f"{day}T12:00:00").astype(int)
+    assert any(f"the month is taken first in dates such as {date}" in note for note in found.notes) != clear
+
+
 def test_a_column_that_gives_all_rows_one_time_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path, "t,day,gyro_z\n" + "2020-09-13,5,1\n" * 60)
     path.with_name("log.csv.columns.yaml").write_text(
