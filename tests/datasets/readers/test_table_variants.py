@@ -273,6 +273,14 @@ def test_earth_centred_positions_are_fixes(names: str, tmp_path: Path) -> None:
             open_recording(tmp_path / "drive.csv")
 
 
+def test_zeros_in_most_rows_are_no_fixes(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{'48.1,11.5' if k % 5 == 3 else '0.0,0.0'}\n" for k in range(20))
+    found = opened_as_proposed(tmp_path, f"t,lat,lon\n{rows}")
+    assert found.gnss is not None
+    assert found.gnss.enu_m[:, :2].tolist() == [[0.0, 0.0]] * 4
+    assert any("16 of 20 rows hold no fix; left out" in note for note in found.notes)
+
+
 def test_headings_in_degrees_are_no_yaw_in_radians(tmp_path: Path) -> None:
     """A heading in degrees is a compass's, clockwise from north; the yaw of a pose keeps its sense."""
     rows = "0,0,0,{0}\n1,1,0,{1}\n"
