@@ -16,6 +16,8 @@ FIRST_YEAR, LAST_YEAR = 1900, 2200
 DAY_NS = 86_400 * 10**9
 OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
 """A time of day alone."""
+OF_CLOCK = re.compile(r"(\d{1,2})([0-5]\d)([0-5]\d(?:\.\d*)?)")
+"""A time of day without colons, as in NMEA: 93015.2 is 9:30:15.2."""
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?!\d)")
 _SLASHED = re.compile(r"(\d{1,2})[/-](\d{1,2})[/-](\d{4})(?!\d)")
 _NAMED = re.compile(r"(\d{1,2})[- ]([A-Za-z]{3})[- ](\d{4})(?!\d)")

@@ -23,7 +23,13 @@ from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE
 DEG = math.pi / 180.0
 
 UNITS: dict[str, dict[str, float]] = {
-    "radps": {"rad/s": 1.0, "deg/s": DEG, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
+    "radps": {
+        "rad/s": 1.0,
+        "deg/s": DEG,
+        "mdeg/s": 1e-3 * DEG,
+        "rpm": math.pi / 30.0,
+        "rev/s": 2.0 * math.pi,
+    },
     "mps": {"m/s": 1.0, "km/h": 1.0 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "mph": 0.44704, "kn": 1852.0 / 3600.0},
     "mps2": {"m/s2": 1.0, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2, "cm/s2": 1e-2, "mm/s2": 1e-3},
     "m": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},

@@ -8,6 +8,7 @@ from terrafusion.datasets.readers.text.column_map import FIELDS, TEXT_FIELDS, YA
 
 _WORDS = {
     "deg/s": "deg/s|°/s|dps|degps|degs|deg_s|deg_per_s|deg/sec",
+    "mdeg/s": "mdeg/s|mdps",
     "rad/s": "rad/s|radps|rads|rad_s|rad/sec|rads^-1",
     "rpm": "rpm|1/min|u/min",
     "rev/s": "rev/s|rps|revps",
@@ -34,6 +35,10 @@ UNIT_OF = {word: unit for unit, words in _WORDS.items() for word in words.split(
 UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", "mA", "Pa", "hPa")}
 """Units as headers write them, in brackets or behind an underscore."""
 TIME_UNITS = ("s", "ms", "us", "ns")
+_ELEMENT = re.compile(
+    r"(?:(?<=gyro)|(?<=accel)|(?<=acc)|(?<=acceleration)|(?<=angular_velocity))\[([012])\]$"
+)
+"""Elements of vectors of an IMU."""
 _BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
 TIME = re.compile(
     r"(^|_)([a-z]*time|timestamp|stamp|ts?|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
@@ -155,8 +160,8 @@ _SENSOR = re.compile(
 @dataclass(frozen=True)
 class Header:
     """A column's name, without its unit, in small letters with underscores; the unit, "" for none; the sensor
-    in front of the name; whether an encoder counts from row to row, by its name; and which of several sensors
-    the name tells, "" for none."""
+    in front of the name; whether an encoder counts from row to row, by its name; which of several sensors
+    the name tells, "" for none; and whether it has a unit that is not known."""
 
     column: str
     base: str
@@ -164,6 +169,7 @@ class Header:
     sensor: str
     increments: bool = False
     device: str = ""
+    strange_unit: bool = False
 
 
 def is_time(name: str) -> bool:
@@ -174,6 +180,10 @@ def is_time(name: str) -> bool:
 def header_of(name: str) -> Header:
     bracketed = None if re.search(r"\[\d+\]$", name) else _BRACKETS.match(name)  # an element of an array
     base, unit = (bracketed[1], bracketed[2]) if bracketed else (name, "")
+    if element := _ELEMENT.search(name):
+        base = name[: element.start()] + "_" + "xyz"[int(element[1])]
+    elif unit.lower() in ("x", "y", "z"):
+        base, unit = f"{base}_{unit}", ""
     base = re.sub(r"([a-z])([A-Z])", r"\1_\2", base.strip())
     base = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
     known = UNIT_OF.get(re.sub(r"\s+", "", unit.strip().lower()), UNIT_OF.get(unit.strip().lower(), ""))
@@ -199,7 +209,15 @@ def header_of(name: str) -> Header:
     sensor = _SENSOR.match(base)
     if sensor:
         base, device = base[sensor.end() :], f"{sensor[1] or ''}{(sensor[3] or '').strip('_')}"
-    return Header(name, base, known, sensor[2] if sensor else "", increments, device)
+    return Header(
+        name,
+        base,
+        known,
+        sensor[2] if sensor else "",
+        increments,
+        device,
+        bool(unit.strip(" -")) and not known,
+    )
 
 
 def _guess(header: Header) -> tuple[str, str] | None:

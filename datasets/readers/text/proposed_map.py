@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
+from terrafusion.datasets.core.decimals import OF_CLOCK, OF_DAY, iso_dates
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
 from terrafusion.datasets.readers.text.column_map import DDMM, ECEF, VARIANCE, YAW_RATE, units_of
@@ -46,6 +46,7 @@ _LONGEST_STEP_S = 2.0
 """Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_NMEA_DATE = re.compile(r"^([0-3]\d)([01]\d)(\d\d)$")
 _NEAR_GROUND_M = (6.3e6, 6.4e6)
 """Distances of ground robots from the centre of the Earth: x, y, z are ECEF."""
 _TURN_RAD = 6.3
@@ -261,8 +262,10 @@ def _day(headers: Sequence[Header], time: Header, cells: Mapping[str, str]) -> s
         starts = gps_to_unix_ns(np.array(full[:1], dtype=np.int64) * WEEK_S * 10**9)
         return "".join(f"{np.datetime64(int(start), 'ns').astype('datetime64[s]')}Z" for start in starts)
     dates = iso_dates([cell for header, cell in others if TIME.search(header.base)])
+    dates = [_NMEA_DATE.sub(r"20\3-\2-\1", date) for date in dates]
     known = [date for date in dates if re.fullmatch(r"\d{4}-\d\d-\d\d", date)]
-    return known[0] if known and _cell_of_day(time, cells) else ""
+    of_day = _cell_of_day(time, cells) or OF_CLOCK.fullmatch(cells.get(time.column, ""))
+    return known[0] if known and of_day else ""
 
 
 def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[float]) -> str:
@@ -271,7 +274,8 @@ def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[f
     unit = unit if unit in TIME_UNITS else ""
     since = f", epoch: {json.dumps(day)}" if day else ""
     value = number_in(cell.removesuffix(" sec").replace(",", "."))
-    if value is None and cell.strip():
+    clocks = bool(OF_CLOCK.fullmatch(cell)) and all(number % 100.0 < 60.0 for number in sample)
+    if (value is None and cell.strip()) or (clocks and (day or "utc" in time.base.split("_"))):
         return f"{{column: {name}, unit: iso8601{since}}}"
     if value is None:
         return f"{{column: {name}, unit: {unit or 's'}, epoch: unix}}"

@@ -16,6 +16,7 @@ from terrafusion.datasets.core.channels import Gnss, Wheels
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import (
     DAY_NS,
+    OF_CLOCK,
     OF_DAY,
     NotADecimal,
     dates_to_ns,
@@ -66,6 +67,8 @@ PACKED = (".csv.gz", ".tsv.gz")
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 
 _OF_HOUR = re.compile(r"\d\d:\d\d\.\d+")
+_DAYS = re.compile(r"^\d+ days? \+?(?=\d)")
+"""In front of the times of day of pandas' differences of times."""
 SHOWN_COLUMNS = 60
 MOST_AT_ONCE = 50
 """So many rows of one time, and no other, are no log."""
@@ -73,6 +76,8 @@ LONG_S = 20.0
 """No robot that is worth a log stands for so long (assumed)."""
 EARTH_M, FAR_M = 6.37e6, 1e5
 """Mean radius of the Earth, and how far from it a ground robot is at most."""
+LEAST_ROWS, SHORTEST_STEP_S = 20, 1e-6
+"""So many rows tell how far they are apart; no sensor is read faster."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -143,11 +148,15 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     if "increments" not in proposal:
         open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
-    for taken, left in second_sensors([header_of(name) for name in names]).items():
+    headers = [header_of(name) for name in names]
+    for taken, left in second_sensors(headers).items():
         ask += (
             f" (of several sensors it takes that of {taken}: for another write its columns, {left[0]}, ...)"
         )
-    unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
+    rest = left_out(names, proposal)
+    if strange := [header.column for header in headers if header.strange_unit and header.column not in rest]:
+        ask += f" (the units in {', '.join(strange)} are not known)"
+    unused = f" and which leaves out {', '.join(rest)}" if rest else ""
     return DataError(
         f"nothing says what the columns {given} are",
         remedy=f"correct this proposal, whose fields and units are guesses{ask}{unused} "
@@ -217,6 +226,7 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
             f"the time of row {int(late[0]) + 1} is {t_ns[late[0]] * 1e-9:.9g} s",
             remedy=f"is the unit {time.unit}?",
         )
+    _check_unit(t_ns, time)
     if time.epoch == "none":
         return t_ns, ["times have no calendar"]
     if time.epoch == "gps":
@@ -227,13 +237,27 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     return t_ns, []
 
 
+def _check_unit(t_ns: TimesNs, time: TimeColumn) -> None:
+    """Refuse times of rows (N,) that are of another kind than numbers in the unit."""
+    span_s = float(np.ptp(t_ns)) * 1e-9 if len(t_ns) > LEAST_ROWS else 0.0
+    step_s = span_s / max(len(t_ns) - 1, 1)
+    if 0.0 < step_s < SHORTEST_STEP_S:
+        what = f"rows are {step_s:.2g} s apart by column '{time.column}'"
+        raise DataError(what, remedy=f"is its unit {time.unit}? write days, as Excel counts them, as dates")
+    if time.unit == "s" and span_s > 200.0 and step_s < 10.0 and (t_ns % (100 * 10**9) < 60 * 10**9).all():
+        what = f"column '{time.column}' holds hours, minutes and seconds such as {t_ns[0] * 1e-9:06.0f}"
+        raise DataError(what, remedy="give it the unit iso8601 in the column map")
+
+
 def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64], list[str]]:
     """Dates with times, or times of day: these begin on the day of the epoch, and go on after midnight.
 
     So do minutes and seconds, as Excel shows times, after each hour.
     """
     texts = columns.texts(time.column).tolist()
-    plain = iso_dates(texts)
+    plain = [_DAYS.sub("", text) for text in iso_dates(texts)]
+    if plain and all(map(OF_CLOCK.fullmatch, plain)):
+        plain = [OF_CLOCK.sub(r"\1:\2:\3", text) for text in plain]
     turn_ns = DAY_NS
     if plain and all(map(_OF_HOUR.fullmatch, plain)):
         plain, turn_ns = [f"00:{text}" for text in plain], DAY_NS // 24

@@ -132,7 +132,9 @@ def _layout(data: bytes, column_map: ColumnMap | None, preface: int) -> TextLayo
     separator = (column_map.separator if column_map else "") or separator_of(header)
     cells = split(header, separator)
     first_line = number + 1
+    numbers = [cell for cell in cells if number_in(cell) is not None]
     named, row = split(comment, separator) if comment else [], all(map(_is_value, cells))
+    row = row or (column_map is None and cells[:1] == numbers[:1] and 2 * len(numbers) > len(cells))
     if column_map is not None and column_map.header == "none":
         cells, first_line = numbered(len(cells)), number
     elif row and len(named) == len(cells):

@@ -39,6 +39,7 @@ def ns(text: str) -> int:
 
 EXACT = {
     ("gyro_z_radps", "deg/s"): (180.0, np.pi),
+    ("gyro_z_radps", "mdeg/s"): (180e3, np.pi),
     ("gyro_z_radps", "rpm"): (30.0, np.pi),
     ("gyro_z_radps", "rev/s"): (0.5, np.pi),
     ("accel_z_mps2", "g"): (1.0, 9.80665),

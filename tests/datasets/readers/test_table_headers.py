@@ -387,3 +387,61 @@ def test_commas_between_thousands_or_for_points(
 def test_a_comma_that_may_be_either_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"column 'right_rpm' is '1,125' at line 2"):
         proposed(tmp_path, 't,gz,left_rpm,right_rpm\n0,1,2,"1,125"\n')
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "start"),
+    [
+        ("utc_time,date", "235959.5,010524 000000.0,020524", "2024-05-01T23:59:59.5"),
+        ("utc,gx", "93015.25,0 93016.0,0", "1970-01-01T09:30:15.25"),
+        ("time,gx", "0_days_23:59:59.500000,0 1_days_00:00:00,0", "1970-01-01T23:59:59.5"),
+    ],
+)
+def test_times_of_day_without_colons_and_of_pandas(names: str, rows: str, start: str, tmp_path: Path) -> None:
+    lines = "".join(f"{row.replace('_', ' ')},1\n" for row in rows.split(" "))
+    imu = proposed(tmp_path, f"{names},gz\n{lines}").imu
+    assert imu is not None
+    assert imu.t_ns[0] == np.datetime64(start, "ns").astype(np.int64)
+    assert 0 < imu.t_ns[1] - imu.t_ns[0] < 10**9
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([45413.5 + k / 86400e2 for k in range(30)], r"rows are 1.2e-07 s apart.*as Excel counts them"),
+        (
+            [120000 + 100 * (k // 60) + k % 60 for k in range(300)],
+            "seconds such as 120000; give it the unit iso",
+        ),
+    ],
+)
+def test_times_that_are_no_seconds_are_refused(times: list[float], said: str, tmp_path: Path) -> None:
+    rows = "".join(f"{t:.9f},1\n" for t in times)
+    path = table(
+        tmp_path,
+        f"clock,gz\n{rows}",
+        "time: {column: clock, epoch: none}\nchannels: {imu: {gyro_z_radps: gz}}",
+    )
+    with pytest.raises(DataError, match=said):
+        open_recording(path)
+
+
+def test_axes_in_brackets_and_units_that_nobody_knows(tmp_path: Path) -> None:
+    names = "t,Gyro (x),gyro[2],acc[0],Acc Z [foo],Gyro (y) [mdps]"
+    (path := tmp_path / "drive.csv").write_text(f"{names}\n0,1,1,1,1,1\n")
+    with pytest.raises(DataError, match=r"the units in Acc Z \[foo\] are not known") as refused:
+        open_recording(path)
+    for entry in (
+        'gyro_x_radps: "Gyro (x)"', 'gyro_z_radps: "gyro[2]"', 'accel_x_mps2: "acc[0]"',
+        'gyro_y_radps: {column: "Gyro (y) [mdps]", unit: mdeg/s}',
+    ):  # fmt: skip
+        assert entry in str(refused.value)
+
+
+def test_a_first_row_with_a_word_in_it_is_no_header(tmp_path: Path) -> None:
+    """So does `ros2 topic echo --csv` write messages."""
+    (path := tmp_path / "drive.csv").write_text("1714564800,5,imu_link,0.1\n1714564801,5,imu_link,0.2\n")
+    with pytest.raises(
+        DataError, match=r"columns 1, 2, 3, 4 \(first row: 1714564800, 5, imu_link.*header: none"
+    ):
+        open_recording(path)
