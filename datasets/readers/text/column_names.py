@@ -46,7 +46,9 @@ TIME = re.compile(
 WEEK = re.compile(r"(^|_)(g?wk|week|week_?n(r|o|um|umber)?|wn)$")
 OF_WEEK = re.compile(r"(^|_)(i?tow|sow)(_|$)|of_week")
 """Names of GPS weeks, and of the time within one."""
-_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu", "wheels": "wheels"}
+_TRUTH = ("gt", "truth", "groundtruth", "ground_truth", "mocap", "vicon", "optitrack")
+_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu", "wheels": "wheels", "odom": "wheels"}
+_OWNER |= dict.fromkeys(_TRUTH, "truth")
 """Channel that a column belongs to by the sensor in front of its name: gps_speed is none of the wheels."""
 
 SIDES = {
@@ -58,6 +60,7 @@ SIDES = {
     "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
 }
 _SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
+_SIGMA = "std?_?dev|std|sigma|sd"
 _ROTATION = "w|omega|rpm"
 _TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
 
@@ -79,6 +82,10 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (r"(?:fix_)?qual(?:ity)?|q|status_status", "gnss", ("fix",)),
     (r"s_?acc|speed_acc(?:uracy)?", "gnss", ("sigma_v_mps",)),
     (r"fix_type", "gnss", ("fix",)),
+    *(
+        (rf"(?:{_SIGMA})_?(?:{words})|(?:{words})_?(?:{_SIGMA})", "gnss", (f"sigma_{a}_m",))
+        for a, words in (("e", "lon|longitude|east"), ("n", "lat|latitude|north"), ("u", "alt|height|up"))
+    ),
     (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
     *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
     (r"up", "gnss", ("up_m",)),
@@ -136,7 +143,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ),
     *((rf"(?:pos|position|truth)?_?{a}|p_rs_r_{a}", "truth", (f"{a}_m",)) for a in "xyz"),
     *((rf"q_rs_{a}", "truth", (f"q{a}",)) for a in "xyzw"),
-    (r"yaw|heading", "truth", ("yaw_rad",)),
+    (r"yaw|heading|theta", "truth", ("yaw_rad",)),
 )
 """Names of columns that people often use, the channel, and its fields that they may stand for."""
 _LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
@@ -148,11 +155,13 @@ _MESSAGE = re.compile(
 """Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
 
 
+_OF_ODOMETRY = {"vx": "linear_x", "v_x": "linear_x", "wz": "angular_z", "w_z": "angular_z"}
+"""Names that other sensors give to what they measure themselves."""
 _FUSED = re.compile(r"filter|fused|ekf|ukf|slam|visual|camera|lidar|locali[sz]|amcl")
 """Topics of estimates, which are no odometry of wheels."""
 _SENSOR = re.compile(
     r"(?:((?:front|rear|back|left|right|top|base|body|main|second(?:ary)?|primary)_)(?=imu|gps|gnss))?"
-    r"(imu|gps|gnss|odom|robot|wheels)(_?\d+)?_(?=.)"
+    rf"(imu|gps|gnss|odom|robot|wheels|{'|'.join(_TRUTH)})(_?\d+)?_(?=.)"
 )
 """A sensor in front of the name of its column, and which of several it is."""
 
@@ -208,7 +217,9 @@ def header_of(name: str) -> Header:
         known = "rpm"
     sensor = _SENSOR.match(base)
     if sensor:
-        base, device = base[sensor.end() :], f"{sensor[1] or ''}{(sensor[3] or '').strip('_')}"
+        base = base[sensor.end() :]
+        base = _OF_ODOMETRY.get(base, base) if sensor[2] == "odom" else base
+        device = f"{sensor[1] or ''}{(sensor[3] or '').strip('_')}"
     return Header(
         name,
         base,

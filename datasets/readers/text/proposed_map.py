@@ -107,6 +107,7 @@ def starter_map(
     channels: dict[str, dict[str, str]] = {}
     others = {name for several in second_sensors(headers).values() for name in several}
     headers = [header for header in headers if header.column not in others]
+    headers.sort(key=lambda header: "lin" in header.base and "acc" in header.base)  # mostly without gravity
     for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
         if header.column in (time.column, rest):
             continue

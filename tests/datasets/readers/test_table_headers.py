@@ -318,54 +318,6 @@ def test_the_speed_of_motors_is_proposed_with_a_gear_ratio_to_fill_in(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("names", "fields"),
-    [
-        ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
-        ("odo_speed,forward_velocity", ["speed_mps"]),
-        ("x_utm,y_utm", ["east_m", "north_m"]),
-        ("E,N", ["east_m", "north_m"]),
-        ("Easting [m],Northing [m],N", ["east_m", "north_m"]),
-        ("E,count", []),
-    ],
-)
-def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields: list[str]) -> None:
-    proposal = starter_map(["t", "gz", *names.split(",")])
-    found = [
-        name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
-    ]
-    assert found == fields
-
-
-def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:
-    names = ["t", "lat", "lon", "fix_type"]
-    assert "mavlink" in starter_map(names, ["0", "48.1", "11.5", "6"])
-    assert "fix" not in starter_map(names, ["0", "48.1", "11.5", "RTK_FIXED"])
-
-
-@pytest.mark.parametrize(
-    ("taken", "others"),
-    [
-        ("imu1_gz,imu1_ax", "imu2_gz,imu2_ax"),
-        ("imu_2_ax,imu2_gz", "imu_1_gz"),
-        ("rear_imu_gyro_z", "front_imu_gyro_z,front_imu_acc_z"),
-        ("/imu/angular_velocity/z,/imu/linear_acceleration/x", "/b/angular_velocity/z"),
-        ("gps1_lat,gps1_lon", "gps2_lat,gps2_lon,gps2_alt"),
-        ("/odom/twist/twist/linear/x", "/odometry/filtered/twist/twist/linear/x"),
-        ("gps_lat,gps_lon,gnss_hacc,imu_gz,acc_x", ""),
-    ],
-)
-def test_of_several_sensors_the_first_is_proposed_and_said(taken: str, others: str, tmp_path: Path) -> None:
-    columns = ",".join(filter(None, (taken, others)))
-    (path := tmp_path / "drive.csv").write_text(f"t,{columns}\n0{',1' * len(columns.split(','))}\n")
-    with pytest.raises(DataError) as refused:
-        open_recording(path)
-    said, _, proposal = str(refused.value).partition(".columns.yaml: ")
-    assert [name for name in columns.split(",") if f'"{name}"' in proposal] == taken.split(",")
-    assert (f"leaves out {others.replace(',', ', ')} (" in said) == bool(others)
-    assert ("of several sensors it takes that of" in said) == (others != "" and "filtered" not in others)
-
-
-@pytest.mark.parametrize(
     ("text", "rpm", "said"),
     [
         ('t,gz,left_rpm,right_rpm\n0,1,999.5,"1,999.5"\n1,234,567,"1,000"\n', [999.5, 1999.5], "thousands"),
@@ -424,18 +376,6 @@ def test_times_that_are_no_seconds_are_refused(times: list[float], said: str, tm
     )
     with pytest.raises(DataError, match=said):
         open_recording(path)
-
-
-def test_axes_in_brackets_and_units_that_nobody_knows(tmp_path: Path) -> None:
-    names = "t,Gyro (x),gyro[2],acc[0],Acc Z [foo],Gyro (y) [mdps]"
-    (path := tmp_path / "drive.csv").write_text(f"{names}\n0,1,1,1,1,1\n")
-    with pytest.raises(DataError, match=r"the units in Acc Z \[foo\] are not known") as refused:
-        open_recording(path)
-    for entry in (
-        'gyro_x_radps: "Gyro (x)"', 'gyro_z_radps: "gyro[2]"', 'accel_x_mps2: "acc[0]"',
-        'gyro_y_radps: {column: "Gyro (y) [mdps]", unit: mdeg/s}',
-    ):  # fmt: skip
-        assert entry in str(refused.value)
 
 
 def test_a_first_row_with_a_word_in_it_is_no_header(tmp_path: Path) -> None:
