@@ -60,6 +60,7 @@ _TOGETHER = (
     ("gnss", ("ecef_x_m", "ecef_z_m")),
     ("gnss", ("ecef_x_m", "ecef_y_m")),
     ("gnss", ("v_e_mps", "v_n_mps")),
+    ("gnss", ("sigma_e_m", "sigma_n_m")),
     ("motor", ("left_a", "right_a")),
     ("motor", ("left_v", "right_v")),
     ("truth", ("x_m", "y_m")),

@@ -1,6 +1,7 @@
 """Columns of a plain table: of text, and where its header is; of Parquet, by pyarrow, which is optional."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -284,8 +285,18 @@ class ParquetColumns:
         return []
 
     def sample(self, name: str) -> list[float]:
-        """None: the kinds of the columns say what they hold."""
-        return []
+        """The numbers of a column in the first rows."""
+        import pyarrow as pa
+
+        kind = self._file.schema_arrow.field(name).type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+            return []
+        try:
+            batch = next(self._file.iter_batches(SAMPLE_ROWS, columns=[name]), None)
+        except self._refused as error:
+            raise self._damaged(error) from None
+        cells = [] if batch is None else batch.column(0).to_pylist()
+        return [float(cell) for cell in cells if cell is not None and math.isfinite(cell)]
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""

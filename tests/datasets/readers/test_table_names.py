@@ -77,7 +77,7 @@ def test_axes_in_brackets_and_units_that_nobody_knows(tmp_path: Path) -> None:
         ("gt_x,gt_y,gt_yaw", ["x_m: gt_x", "y_m: gt_y", "yaw_rad: gt_yaw"]),
         ("linear_acceleration_z,acceleration_z", ["accel_z_mps2: acceleration_z"]),
         ("lat,lon,std_lat,lon_stdev", ["sigma_n_m: std_lat", "sigma_e_m: lon_stdev"]),
-        ("lat,lon,std_lat", ["sigma_n_m: std_lat"]),
+        ("lat,lon,std_lat", ["longitude_deg: lon}}"]),
     ],
 )
 def test_names_tell_odometry_truth_and_sigmas(names: str, entries: list[str], tmp_path: Path) -> None:
