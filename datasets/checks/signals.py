@@ -77,11 +77,15 @@ def sensors_of(recording: Recording) -> list[SensorAxes]:
     return found
 
 
+LARGE_M = 1.0
+"""Positions spread with the length of a drive: who goes a tenth of this in a second, moves."""
+
+
 def check_held(context: CheckContext) -> Iterator[Finding]:
     """Values repeated between true samples: the rate of the log is not the rate of the sensor."""
     for name, channel in context.recording.channels().items():
         values = _measured(channel)
-        share, run = _held_share(channel.t_ns, values)
+        share, run = _held_share(channel.t_ns, values, LARGE_M if name == "gnss" else np.inf)
         rows = held_rows(values)
         if share <= HELD_SHARE or rows == 1:  # runs of varying length are those of a coarse signal
             continue
@@ -106,14 +110,18 @@ def _measured(channel: Channel) -> Array:
     return np.asarray(values[:, np.isfinite(values).any(axis=0)])
 
 
-def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
-    """Share of repeats among samples inside a change, and the mean run length there."""
+def _held_share(t_ns: TimesNs, values: Array, large: float) -> tuple[float, float]:
+    """Share of repeats among samples inside a change, and the mean run length there.
+
+    Changes are counted from a tenth of the spread of the values on, or of `large`, where that is smaller.
+    """
     values = np.nan_to_num(values)
     if len(values) < 50 or not values.size:
         return 0.0, 1.0
     period = max(float(np.median(np.diff(t_ns))) * 1e-9, 1e-4)
     reach = int(np.clip(round(0.5 / period), 3, 500))
     spread = np.percentile(values, 95, axis=0) - np.percentile(values, 5, axis=0)
+    spread = np.minimum(spread, large)
     across = np.abs(values[2 * reach :] - values[: -2 * reach])
     changing = np.any(across > 0.1 * np.where(spread > 0, spread, np.inf), axis=1)
     same = np.all(values[reach:-reach] == values[reach - 1 : -reach - 1], axis=1)

@@ -228,11 +228,18 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
             what = f"{missing / (len(channel) + missing):.0%} of the samples are missing, one here and there"
             evidence = f"intervals of whole multiples of {period * 1e3:.3g} ms, {missing} of which are empty"
         elif (early_s := _early_s(context, name)) > max(GAP_PERIODS * period, GAP_S):
-            what = f"ends {early_s:.2f} s before the other channels"
+            what = (
+                f"no fix in the last {early_s:.2f} s"
+                if name == "gnss"
+                else (f"ends {early_s:.2f} s before the other channels")
+            )
             evidence = f"its last sample is at t = {context.since_start_s(channel.t_ns[-1]):.2f} s"
         else:
             continue
-        fix = "expect larger uncertainty there, and look for dropped messages or a clock that was set ahead"
+        causes = "dropped messages or a clock that was set ahead"
+        if name == "gnss":  # rows without a fix are none of its samples
+            causes = f"a receiver that lost its satellites, {causes}"
+        fix = f"expect larger uncertainty there, and look for {causes}"
         yield Finding("gaps", "warning", name, what, evidence, fix)
 
 

@@ -16,6 +16,8 @@ FIRST_YEAR, LAST_YEAR = 1900, 2200
 DAY_NS = 86_400 * 10**9
 OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
 """A time of day alone."""
+OF_CLOCK = re.compile(r"(\d{1,2})([0-5]\d)([0-5]\d(?:\.\d*)?)")
+"""A time of day without colons, as in NMEA: 93015.2 is 9:30:15.2."""
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?!\d)")
 _SLASHED = re.compile(r"(\d{1,2})[/-](\d{1,2})[/-](\d{4})(?!\d)")
 _NAMED = re.compile(r"(\d{1,2})[- ]([A-Za-z]{3})[- ](\d{4})(?!\d)")
@@ -100,22 +102,40 @@ def iso_dates(texts: Sequence[str]) -> list[str]:
     """Dates and times without blanks around as in ISO 8601, where one of them tells how they are meant.
 
     3.9.2020 has the day first, 3-Sep-2020 names the month; with slashes that shows in a date of the column
-    such as 9/13/2020. A date that is not understood stays as it is.
+    such as 9/13/2020; else the month is first where times are of half days (assumed). A date that is not
+    understood stays as it is.
     """
     plain = [text.strip().replace(",", ".") for text in texts]
-    if any(text[-1:] in "mM." for text in plain):
+    half_days = any(map(_HALF_DAY.search, plain))
+    if half_days:
         plain = [_HALF_DAY.sub(_of_24_hours, text) for text in plain]
     if any(map(_ZONE.search, plain)):
         plain = [_ZONE.sub(lambda zone: zone[1] or "Z", text) for text in plain]
-    pairs = {(int(d[1]), int(d[2])) for d in map(_SLASHED.match, plain) if d}
+    pairs = _slashed(plain)
     months, days = {first for first, _ in pairs}, {second for _, second in pairs}
-    month_first = max(months, default=13) <= 12 and (max(days) > 12 or all(a == b for a, b in pairs))
+    clear = max(days, default=0) > 12 or half_days or all(a == b for a, b in pairs)
+    month_first = max(months, default=13) <= 12 and clear
     if month_first or (max(days, default=13) <= 12 < max(months)):
         month, day = (1, 2) if month_first else (2, 1)
         plain = [
             _SLASHED.sub(lambda d: f"{d[3]}-{d[month]:0>2}-{d[day]:0>2}", text, count=1) for text in plain
         ]
     return [_NAMED.sub(_of_named, _DAY_FIRST.sub(_of_day_first, text, count=1), count=1) for text in plain]
+
+
+def month_is_assumed(texts: Sequence[str]) -> bool:
+    """Whether nothing but their half days tells `iso_dates` that the month of slashed dates is first."""
+    pairs = _slashed([text.strip() for text in texts])
+    return (
+        any(map(_HALF_DAY.search, texts))
+        and max(map(max, pairs), default=13) <= 12
+        and any(month != day for month, day in pairs)
+    )
+
+
+def _slashed(texts: Sequence[str]) -> set[tuple[int, int]]:
+    """The first two numbers of dates such as 9/13/2020."""
+    return {(int(date[1]), int(date[2])) for date in map(_SLASHED.match, texts) if date}
 
 
 def _of_day_first(date: re.Match[str]) -> str:

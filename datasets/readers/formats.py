@@ -29,6 +29,8 @@ HINTS = (
     (b"ULog", "export it by ulog2csv of pyulog as tables (.csv)"),
 )
 """How to go on with a file that is not read, by its first bytes."""
+OFFICE = (".xlsx", ".xlsm", ".ods", ".npz", ".mat")
+"""Files that are packed, but with nothing inside that can be read."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +142,9 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if found is None:
-        kinds = ", ".join(form.description for form in FORMATS)
+        kinds = ", ".join(form.description for form in FORMATS if ".sets." not in form.module)
         first = next((hint for start, hint in HINTS if head.startswith(start)), EXPORT)
+        first = EXPORT if path.suffix.lower() in OFFICE else first
         raise DataError(
             f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
             file=path,

@@ -64,7 +64,7 @@ def _as_one(logs: Sequence[str]) -> str:
         return "; if they are one bag, `ros2 bag reindex` writes its metadata.yaml"
     if all(name.endswith(".bag") for name in logs):
         return "; parts of one drive have names that end in _0.bag, _1.bag, ..."
-    return "; for one drive, write a column map beside each table (Plain tables in docs/reference/formats.md)"
+    return "; for one drive, write a column map beside each table: `terrafusion inspect TABLE` proposes it"
 
 
 def _is_channel(path: Path) -> bool:

@@ -57,6 +57,8 @@ def open_recordings(
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
     if not (topics is None or isinstance(topics, Mapping)):
         raise DataError(f"topics is {topics!r}", file=path, remedy="give {'imu': '/imu/data', ...}")
+    if not (columns is None or isinstance(columns, (str, Path))):
+        raise DataError(f"columns is {columns!r}", file=path, remedy="give the path of a column map")
     place, number = find_log(path)
     form = format_of(place, mapped=columns is not None)
     entry, conventions, notes = _known(place, form)

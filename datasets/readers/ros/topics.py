@@ -79,6 +79,15 @@ _NAMED = {"truth": _TRUTH, "datum": _DATUM, "terrain": _TERRAIN, "command": _COM
 _RAW = re.compile(r"raw", re.IGNORECASE)
 _ROBOT = re.compile(r"([_-]?\d+|[_-][a-z])/$", re.IGNORECASE)
 """What tells names of robots such as husky_1 and husky_2 apart."""
+_PART = re.compile(
+    r"imu|ins|ahrs|gyro|acc|gps|gnss|rtk|nav|fix|mag|baro|wheel|odom|enc|joint|motor|drive|steer|track|base|body|chassis"
+    r"|platform|vehicle|robot|sens|control|driver|device|hardware|hw|board|mcu|micro|arduino|esp|stm|teensy|can|ros"
+    r"|camera|realsense|zed|oak|kinect|lidar|ouster|velodyne|livox|hesai|sick|vectornav|vn\d|xsens|mti|microstrain|adis"
+    r"|bno|mpu|phidget|razor|novatel|oem|septentrio|mosaic|ublox|zed_f9p|trimble|piksi|swift|emlid|reach|sbg|ellipse"
+    r"|kvh|oxts|applanix|fixposition|anello|spatial|witmotion|roboteq|vesc|odrive|sabertooth|local|global|raw|data",
+    re.IGNORECASE,
+)
+"""In names of sensors, boards and drivers, which are no robot's."""
 _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
 
 MOST_SHOWN = 8
@@ -137,7 +146,8 @@ def choose_topics(
         fits = [t for t in bag if t.name == name and t.msgtype in TYPES[kind]]
         if kind not in chosen and fits:
             chosen[kind] = fits[0]
-    bag = _of_one_robot(bag, chosen, is_wheel_joints, one_of, notes)
+    known = len(chosen) > len(_wanted(user or {}))
+    bag = _of_one_robot(bag, chosen, is_wheel_joints, one_of, notes, known=known)
     for kind in TYPES:
         taken = {t.name for k, t in chosen.items() if k != kind and {k, kind} != {"wheels", "steering"}}
         found = [t for t in bag if t.msgtype in TYPES[kind] and t.name not in taken]
@@ -160,12 +170,15 @@ def _of_one_robot(
     has_joints: Callable[[str], bool],
     one_of: Callable[[str, list[BagTopic]], BagTopic],
     notes: list[str],
+    *,
+    known: bool,
 ) -> list[BagTopic]:
     """The bag without topics of other robots than that of the wheels; chooses the wheels where they are open.
 
     A namespace with wheels and another sensor is a robot's, and so are those named alike but for a number or
-    a letter (husky_1, husky_2) that hold both together. Whether these are boards of one robot is asked where
-    none has what another has.
+    a letter (husky_1, husky_2) that hold both together, or named neither as sensors nor as boards (husky,
+    jackal), unless it is `known` which topics are of the robot. Whether these are parts of one robot is asked
+    where none has what another has.
     """
     sensors = [(t, kind) for t in bag for kind in SENSORS if t.msgtype in TYPES[kind]]
     paths = [t.name.split("/") for t, _ in sensors]
@@ -176,8 +189,9 @@ def _of_one_robot(
             space = "/".join(path[: depth + 1]) + "/"
             spaces.setdefault(space, {}).setdefault(kind, []).append(topic)
     robots = [space for space, kinds in spaces.items() if _makes_a_robot(kinds)]
-    for space in spaces:
-        alike = [other for other in spaces if _ROBOT.sub("", other) == _ROBOT.sub("", space)]
+    names = [space for space in spaces if not (known or _PART.search(space))]
+    for space in (*spaces, ""):
+        alike = [other for other in spaces if _ROBOT.sub("", other) == _ROBOT.sub("", space)] or names
         if len(robots) < 2 <= len(alike) and _makes_a_robot(kind for one in alike for kind in spaces[one]):
             robots = alike
             held = [(kind, topics[0].name) for one in alike for kind, topics in spaces[one].items()]
@@ -188,7 +202,7 @@ def _of_one_robot(
     if "wheels" not in chosen:
         rank = functools.partial(_rank, "wheels")
         of_each = [min(spaces[one]["wheels"], key=rank) for one in robots if "wheels" in spaces[one]]
-        chosen["wheels"] = one_of("wheels", of_each)
+        chosen["wheels"] = one_of("wheels", of_each) if len(of_each) > 1 else of_each[0]
     others = tuple(one for one in robots if not chosen["wheels"].name.startswith(one))
     if len(others) == len(robots):
         return bag

@@ -23,7 +23,13 @@ from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE
 DEG = math.pi / 180.0
 
 UNITS: dict[str, dict[str, float]] = {
-    "radps": {"rad/s": 1.0, "deg/s": DEG, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
+    "radps": {
+        "rad/s": 1.0,
+        "deg/s": DEG,
+        "mdeg/s": 1e-3 * DEG,
+        "rpm": math.pi / 30.0,
+        "rev/s": 2.0 * math.pi,
+    },
     "mps": {"m/s": 1.0, "km/h": 1.0 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "mph": 0.44704, "kn": 1852.0 / 3600.0},
     "mps2": {"m/s2": 1.0, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2, "cm/s2": 1e-2, "mm/s2": 1e-3},
     "m": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
@@ -56,13 +62,14 @@ def units_of(field: str) -> dict[str, float]:
 
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
+ECEF = ("ecef_x_m", "ecef_y_m", "ecef_z_m")
 FIELDS = {channel: (*columns.numbers, *columns.texts) for channel, columns in COLUMNS.items()}
-FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"])
+FIELDS["gnss"] = (*GEODETIC, *FIELDS["gnss"], *ECEF)
 FIELDS["truth"] = (*FIELDS["truth"][:3], "yaw_rad", *FIELDS["truth"][3:])
 YAW_RATE = "yaw_rate_radps"
 FIELDS["wheels"] = (*FIELDS["wheels"], YAW_RATE)
-"""Fields of each channel: the columns of the log folder, latitude and longitude, a plain yaw, and the yaw
-rate of wheel odometry beside its speed. `terrain` also takes p_<class>."""
+"""Fields of each channel: the columns of the log folder, latitude and longitude, ECEF, a plain yaw, and the
+yaw rate of wheel odometry beside its speed. `terrain` also takes p_<class>."""
 
 TEXT_FIELDS = ("fix", "label")
 FIX_CODES = ("", *FIX_OF_CODE)
@@ -114,7 +121,8 @@ class MappedColumn:
     """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way.
 
     The numbers of the column, times `scale`, are in the unit. Those of latitudes and longitudes are negative
-    where the column `hemisphere`, "" for none, says S or W.
+    where the column `hemisphere`, "" for none, says S or W. With `increments` they count from
+    row to row.
     """
 
     column: str
@@ -122,6 +130,7 @@ class MappedColumn:
     sign: Annotated[str, Word(("+", "-"))] = "+"
     scale: Annotated[float, _Scale()] = 1.0
     hemisphere: str = ""
+    increments: bool = False
 
     def columns(self) -> list[str]:
         """Names of the columns that hold it."""
@@ -258,11 +267,10 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
             yield from _field_problems(channel, name, of)
         if YAW_RATE in fields and {*fields} != {YAW_RATE, "speed_mps"}:
             yield f"'wheels' has {', '.join(fields)}", f"{YAW_RATE} stands beside speed_mps alone"
-        if channel == "gnss" and bool({"east_m", "north_m"} & set(fields)) == ("latitude_deg" in fields):
-            yield (
-                "'gnss' has no position, or two",
-                "give either latitude_deg and longitude_deg or east_m and north_m",
-            )
+        positions = (GEODETIC[:2], ("east_m", "north_m"), ECEF)
+        if channel == "gnss" and sum(bool({*fields} & {*one}) for one in positions) != 1:
+            remedy = f"give one of: {' | '.join(map(', '.join, positions))}"
+            yield "'gnss' has no position, or two", remedy
 
 
 def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple[str, str]]:
@@ -279,6 +287,8 @@ def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple
         yield f"'{here}' is in the unit '{shown(of.unit)}'", remedy
     if of.hemisphere and name not in GEODETIC[:2]:
         yield f"'{here}' has a hemisphere", f"only {' and '.join(GEODETIC[:2])} have one"
+    if of.increments and not (channel == "wheels" and name.endswith("_rad")):
+        yield f"'{here}' has increments", "only angles of wheels come as increments"
     if name in TEXT_FIELDS and of.sign != "+":
         yield f"'{here}' has the sign '-', but is a text", "leave the sign out"
     if name in TEXT_FIELDS and of.scale != 1.0:

@@ -72,7 +72,7 @@ def gnss_channel(
         DataError: a latitude or longitude that is not on Earth.
     """
     held = np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE)
-    if not fixes.local and held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
+    if not fixes.local and held.any() and np.abs(fixes.llh[held, :2]).max() > 0.1:
         held &= (fixes.llh[:, :2] != 0.0).any(axis=1)
     notes = []
     if not held.all():

@@ -9,7 +9,7 @@ from typing import Any
 from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.delimited import CutText
-from terrafusion.datasets.readers.text.proposed_map import is_time
+from terrafusion.datasets.readers.text.column_names import is_time
 
 KINDS = ("topic", "type", "sensor", "channel", "msg")
 """Keys whose text says which sensor a line is of."""

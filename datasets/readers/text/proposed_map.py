@@ -3,155 +3,33 @@
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from terrafusion.datasets.core.decimals import OF_DAY, iso_dates
+from terrafusion.datasets.core.decimals import OF_CLOCK, OF_DAY, iso_dates
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.readers.delimited import number_in
-from terrafusion.datasets.readers.text.column_map import (
-    DDMM,
-    FIELDS,
-    TEXT_FIELDS,
-    VARIANCE,
-    YAW_RATE,
-    units_of,
+from terrafusion.datasets.readers.text.column_map import DDMM, ECEF, VARIANCE, YAW_RATE, units_of
+from terrafusion.datasets.readers.text.column_names import (
+    OF_WEEK,
+    SIDES,
+    TIME,
+    TIME_UNITS,
+    UNIT_OF,
+    WEEK,
+    Header,
+    guesses,
+    header_of,
+    of_each,
 )
 
 TICKS = "1/1024"
 """Scale proposed for encoder ticks: nothing in a table says how many make a turn."""
 GEAR = "1/30"
 """Scale proposed for the speed of motors: nothing in a table tells the gear ratio."""
-_WORDS = {
-    "deg/s": "deg/s|°/s|dps|degps|degs|deg_s|deg_per_s|deg/sec",
-    "rad/s": "rad/s|radps|rads|rad_s|rad/sec|rads^-1",
-    "rpm": "rpm|1/min|u/min",
-    "rev/s": "rev/s|rps|revps",
-    "m/s": "m/s|mps|m_s|m/sec",
-    "km/h": "km/h|kmh|kph|kmph|km_h",
-    "cm/s": "cm/s|cmps|cm_s",
-    "mm/s": "mm/s|mmps|mm_s",
-    "kn": "kn|kt|kts|knots",
-    "m/s2": "m/s2|m/s^2|m/s²|m/s/s|mps2|m_s2|ms2|ms-2|ms^-2",
-    "m": "m|meter|metre|meters|metres",
-    "ft": "ft|feet",
-    "rad": "rad",
-    "deg": "deg|°|degree|degrees",
-    "1e-7 deg": "1e-7 deg|1e-7deg|deg*1e7|dege7|e7",
-    "rev": "rev|turns",
-    "A": "a|amp|amps",
-    "ticks": "tick|ticks|count|counts|pulse|pulses",
-    "s": "s|sec|secs|seconds",
-    "ms": "ms|msec|millis",
-    "us": "us|µs|usec|micros",
-    "ns": "ns|nsec|nsecs|nanos|nanosec",
-}
-UNIT_OF = {word: unit for unit, words in _WORDS.items() for word in words.split("|")}
-UNIT_OF |= {unit.lower(): unit for unit in ("mph", "g", "mg", "km", "cm", "mm", "mA", "Pa", "hPa")}
-"""Units as headers write them, in brackets or behind an underscore."""
-TIME_UNITS = ("s", "ms", "us", "ns")
-_BRACKETS = re.compile(r"^(.*?)[\s_]*[\[(]([^\])]*)[\])]\s*$")
-_TIME = re.compile(
-    r"(^|_)([a-z]*time|timestamp|stamp|ts?|sec|secs|seconds|utc|epoch|date|zeit|uhrzeit|datum|i?tow|sow)(_|$)"
-)
-_WEEK = re.compile(r"(^|_)(g?wk|week|week_?n(r|o|um|umber)?|wn)$")
-_OF_WEEK = re.compile(r"(^|_)(i?tow|sow)(_|$)|of_week")
-"""Names of GPS weeks, and of the time within one."""
-_OWNER = {"gps": "gnss", "gnss": "gnss", "imu": "imu", "wheels": "wheels"}
-"""Channel that a column belongs to by the sensor in front of its name: gps_speed is none of the wheels."""
-
-_SIDES = {
-    "left": "left|l",
-    "right": "right|r",
-    "front_left": "front_left|fl|left_front|lf",
-    "front_right": "front_right|fr|right_front|rf",
-    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
-    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
-}
-_SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
-_ROTATION = "w|omega|rpm"
-_TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
-
-
-def _beside(word: str, side: str) -> str:
-    """Pattern of a name that holds a word and a side in either order, with or without "wheel"."""
-    return rf"(?:{word})_?(?:{side})|(?:wheel_)?(?:{side})_?(?:wheel_)?(?:{word})"
-
-
-_PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    (r"lat(?:itude)?", "gnss", ("latitude_deg",)),
-    (r"lon|lng|long|longitude", "gnss", ("longitude_deg",)),
-    (r"alt|altitude|height|h", "gnss", ("height_m",)),
-    (r"(?:fix_)?qual(?:ity)?|q|status_status", "gnss", ("fix",)),
-    (r"s_?acc|speed_acc(?:uracy)?", "gnss", ("sigma_v_mps",)),
-    (r"fix_type", "gnss", ("fix",)),
-    (r"v_?acc|vertical_acc(?:uracy)?", "gnss", ("sigma_u_m",)),
-    *((rf"position_covariance_?{i}", "gnss", (f"sigma_{a}_m",)) for a, i in (("e", 0), ("n", 4), ("u", 8))),
-    (r"up", "gnss", ("up_m",)),
-    *(
-        (
-            rf"{word}|{word}ing|{a}|utm_?(?:{a}|{xy}|{word}|{word}ing)|(?:{a}|{xy})_?utm",
-            "gnss",
-            (f"{word}_m",),
-        )
-        for word, a, xy in (("east", "e", "x"), ("north", "n", "y"))
-    ),
-    *(
-        (rf"v(?:el)?_?(?:{a}|{word})|{word}_vel(?:ocity)?", "gnss", (f"v_{a if a != 'd' else 'u'}_mps",))
-        for a, word in (("e", "east"), ("n", "north"), ("u", "up"), ("d", "down"))
-    ),
-    *(
-        (
-            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}|w_rs_s_{a}",
-            "imu",
-            (f"gyro_{a}_radps",),
-        )
-        for i, a in enumerate("xyz")
-    ),
-    (r"yaw_?rate|(?:gyro_)?yaw_velocity|gyro_yaw|yaw_dot|gyro", "imu", ("gyro_z_radps",)),
-    *(
-        (
-            rf"(?:a|acc|accel|acceleration|linear_acceleration|lin_acc|(?:total_)?acceler(?:ation|ometer))_?{a}"
-            rf"|accelerometer_m_s2_{i}|a_rs_s_{a}",
-            "imu",
-            (f"accel_{a}_mps2",),
-        )
-        for i, a in enumerate("xyz")
-    ),
-    *((_beside(_SPEED, s), "wheels", (f"{side}_mps", f"{side}_radps")) for side, s in _SIDES.items()),
-    *(
-        (rf"(?:wheel_)?(?:{s})(?:_wheel)?", "wheels", (f"{side}_mps", f"{side}_radps"))
-        for side, s in _SIDES.items()
-    ),
-    *((_beside(_ROTATION, s), "wheels", (f"{side}_radps", f"{side}_mps")) for side, s in _SIDES.items()),
-    *((_beside("motor_rpm", s), "wheels", (f"{side}_radps",)) for side, s in _SIDES.items()),
-    *((_beside(_TURNED, s), "wheels", (f"{side}_rad",)) for side, s in _SIDES.items()),
-    (
-        r"(?:(?:wheel|odo|odometer|odometry|vehicle|forward|linear)_)?(?:v|vel|velocity|speed)"
-        r"|(?:twist_)?linear_x|linear_vel(?:ocity)?_x",
-        "wheels",
-        ("speed_mps",),
-    ),
-    (r"w|omega|(?:twist_)?angular_z", "wheels", (YAW_RATE,)),
-    (r"steer(?:ing)?_wheel(?:_angle)?", "steering", ("steering_wheel_rad",)),
-    (r"steer(?:ing)?(?:_angle)?", "steering", ("angle_rad",)),
-    *(
-        (_beside("i|cur|current|motor_current", _SIDES[side]), "motor", (f"{side}_a",))
-        for side in ("left", "right")
-    ),
-    *((rf"(?:pos|position|truth)?_?{a}|p_rs_r_{a}", "truth", (f"{a}_m",)) for a in "xyz"),
-    *((rf"q_rs_{a}", "truth", (f"q{a}",)) for a in "xyzw"),
-    (r"yaw|heading", "truth", ("yaw_rad",)),
-)
-"""Names of columns that people often use, the channel, and its fields that they may stand for."""
-_LEVEL = re.compile(r"h_?acc|horizontal_acc(?:uracy)?")
-"""Names of a horizontal accuracy, which stands for the sigma of both axes."""
-_MESSAGE = re.compile(
-    r"(?:.*_)?(angular_velocity_[xyz]|linear_acceleration_[xyz]|twist_(?:linear_x|angular_z)"
-    r"|latitude|longitude|altitude|status_status|header_stamp|position_covariance_?[048])"
-)
-"""Names of ROS messages' fields, behind the path that exports give them: /odom/twist/twist/linear/x."""
+TRACK = "track_m: 1"
+"""Proposed beside the yaw rate of an odometry, which it keeps."""
 _OF_FILE = (
     ("gyro", re.compile(r"gyro", re.IGNORECASE)),
     ("acc", re.compile(r"^(?!.*lin).*acc", re.IGNORECASE)),
@@ -168,35 +46,32 @@ _LONGEST_STEP_S = 2.0
 """Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_NMEA_DATE = re.compile(r"^([0-3]\d)([01]\d)(\d\d)$")
+_NEAR_GROUND_M = (6.3e6, 6.4e6)
+"""Distances of ground robots from the centre of the Earth: x, y, z are ECEF."""
+_TURN_RAD = 6.3
+"""Headings beyond are in degrees."""
 _HEMISPHERES = {"latitude_deg": ("N", "S"), "longitude_deg": ("E", "W")}
 _NMEA_PLACE = re.compile(r"-?\d{4,5}\.\d+")
 """A latitude or longitude in degrees and minutes; with zeros in front of small ones."""
 _TOGETHER = (
     ("gnss", ("latitude_deg", "longitude_deg")),
     ("gnss", ("east_m", "north_m")),
+    ("gnss", ("ecef_x_m", "ecef_z_m")),
+    ("gnss", ("ecef_x_m", "ecef_y_m")),
     ("gnss", ("v_e_mps", "v_n_mps")),
+    ("gnss", ("sigma_e_m", "sigma_n_m")),
     ("motor", ("left_a", "right_a")),
     ("motor", ("left_v", "right_v")),
     ("truth", ("x_m", "y_m")),
 )
-_NEEDED = {"gnss": ("latitude_deg", "east_m"), "truth": ("x_m",), "motor": ("left_a",)}
+_NEEDED = {"gnss": ("latitude_deg", "east_m", "ecef_x_m"), "truth": ("x_m",), "motor": ("left_a",)}
 """One of these must be there."""
 _WHEELS = tuple(
     tuple(f"{side}_{unit}" for side in sides)
     for unit in ("radps", "mps", "rad")
-    for sides in (tuple(_SIDES)[2:], tuple(_SIDES)[:2])
+    for sides in (tuple(SIDES)[2:], tuple(SIDES)[:2])
 )
-
-
-@dataclass(frozen=True)
-class _Header:
-    """A column's name, without its unit, in small letters with underscores; the unit, "" for none; and the
-    sensor in front of the name."""
-
-    column: str
-    base: str
-    unit: str
-    sensor: str
 
 
 def starter_map(
@@ -205,33 +80,45 @@ def starter_map(
     units: Sequence[str] = (),
     *,
     of_file: str = "",
-    step: Callable[[str], float] = lambda name: 0.0,
+    sample: Callable[[str], Sequence[float]] = lambda name: (),
 ) -> str:
     """A first column map, on one line, for the user to correct.
 
-    The first row's cells tell units, as do those of a line of `units` below the header and the median `step`
-    of a column; the name `of_file` tells the sensor of columns x, y, z.
+    The first row's cells tell units, as do those of a line of `units` below the header and the numbers in a
+    `sample` of a column; the name `of_file` tells the sensor of columns x, y, z.
     """
-    headers = [_header(name) for name in names]
+    headers = [header_of(name) for name in names]
     if {"x", "y", "z"} <= {h.base for h in headers}:
         sensor = next((word for word, name in _OF_FILE if name.search(of_file)), "")
+        xyz = [n for h in headers if h.base in ("x", "y", "z") for n in sample(h.column)[:1]]
+        if _NEAR_GROUND_M[0] < np.linalg.norm(xyz) < _NEAR_GROUND_M[1]:
+            sensor = "ecef"
         headers = [
             replace(h, base=f"{sensor}_{h.base}") if sensor and h.base in "xyz" else h for h in headers
         ]
     for k, (header, unit) in enumerate(zip(headers, units, strict=False)):
-        headers[k] = header if header.unit else replace(_header(f"{header.column} [{unit}]"), column=names[k])
+        headers[k] = (
+            header if header.unit else replace(header_of(f"{header.column} [{unit}]"), column=names[k])
+        )
     cells = dict(zip(names, first, strict=False))
-    times = [h for h in headers if _TIME.search(h.base)]
+    times = [h for h in headers if TIME.search(h.base)]
     of_day = [h for h in times if _cell_of_day(h, cells)]
     time = next((h for h in times if h.base == "header_stamp"), [*of_day, *times, headers[0]][0])
     rest = _nanoseconds(time.column, names)
     channels: dict[str, dict[str, str]] = {}
+    others = {name for several in second_sensors(headers).values() for name in several}
+    headers = [header for header in headers if header.column not in others]
+    headers.sort(key=lambda header: "lin" in header.base and "acc" in header.base)  # mostly without gravity
     for header in headers if not _in_g(headers, cells) else [_of_g(header) for header in headers]:
         if header.column in (time.column, rest):
             continue
-        for channel, field in _guesses(header):
+        for channel, field in guesses(header):
             if field == "fix" and number_in(cells.get(header.column, "") or "0") is None:
                 continue  # words, which may be none of the classes
+            if field == "yaw_rad" and max(map(abs, sample(header.column)), default=0.0) > _TURN_RAD:
+                header = replace(header, unit="deg")
+            if field == "yaw_rad" and (header.base, header.unit) == ("heading", "deg"):
+                continue  # of a compass, mostly
             if field not in channels.get(channel, {}):
                 if _COUNTER.search(header.base) and _WHOLE.fullmatch(cells.get(header.column, "")):
                     header = replace(header, unit=header.unit or "ticks")
@@ -241,7 +128,7 @@ def starter_map(
     gnss = channels.get("gnss", {})
     if "1e-7 deg" in gnss.get("latitude_deg", ""):  # a receiver's own integers
         for header in headers:
-            for channel, field in _guesses(header):
+            for channel, field in guesses(header):
                 whole = field == "height_m" or _WHOLE.fullmatch(cells.get(header.column, ""))
                 small = {"m": "mm", "mps": "mm/s"}.get(field.rpartition("_")[2], "")
                 if channel == "gnss" and field in gnss and small and whole and not header.unit:
@@ -253,13 +140,19 @@ def starter_map(
         for channel, fields in channels.items()
     )
     day = _day(headers, time, cells)
-    entry = _time_entry(time, cells.get(time.column, ""), rest, day, step(time.column))
-    return f"time: {entry}, channels: {{{sections}}}"
+    entry = _time_entry(time, cells.get(time.column, ""), rest, day, sample(time.column))
+    track = f"{TRACK}, " if YAW_RATE in channels.get("wheels", {}) else ""
+    return f"time: {entry}, {track}channels: {{{sections}}}"
 
 
-def is_time(name: str) -> bool:
-    """Whether a column is a time by its name."""
-    return _TIME.search(_header(name).base) is not None
+def second_sensors(headers: Sequence[Header]) -> dict[str, list[str]]:
+    """Columns of all but the first of several sensors alike, by the first column of the first."""
+    found = {}
+    for channel in ("imu", "gnss", "wheels"):
+        first, *rest = [*of_each(headers, channel).values()] or [[]]
+        if rest:
+            found[first[0]] = [name for names in rest for name in names]
+    return found
 
 
 def left_out(names: Sequence[str], proposal: str) -> list[str]:
@@ -267,22 +160,11 @@ def left_out(names: Sequence[str], proposal: str) -> list[str]:
     return [name for name in names if name and json.dumps(name, ensure_ascii=False) not in proposal]
 
 
-def _guesses(header: _Header) -> list[tuple[str, str]]:
-    """Channels and fields that a column may stand for."""
-    if _LEVEL.fullmatch(header.base):
-        return [("gnss", "sigma_e_m"), ("gnss", "sigma_n_m")]
-    if header.base == "fix_type" and not header.column.endswith(header.base):
-        return []  # u-blox's fixType has other codes
-    guess = _guess(header)
-    return [] if guess is None else [guess]
-
-
-def _in_g(headers: Sequence[_Header], cells: Mapping[str, str]) -> bool:
+def _in_g(headers: Sequence[Header], cells: Mapping[str, str]) -> bool:
     """Whether the first specific force is 1, not 9.8, long, in columns without a unit."""
     square, axes = 0.0, 0
     for header in headers:
-        guess = _guess(header)
-        if guess is None or not guess[1].startswith("accel_") or header.unit or header.column == guess[1]:
+        if not _is_force(header):
             continue
         value = number_in(cells.get(header.column, "").replace(",", "."))
         if value is None:
@@ -291,55 +173,20 @@ def _in_g(headers: Sequence[_Header], cells: Mapping[str, str]) -> bool:
     return axes == 3 and _IN_G[0] ** 2 < square < _IN_G[1] ** 2
 
 
-def _of_g(header: _Header) -> _Header:
-    guess = _guess(header)
-    in_g = guess is not None and guess[1].startswith("accel_") and not header.unit
-    return replace(header, unit="g") if in_g else header
+def _of_g(header: Header) -> Header:
+    return replace(header, unit="g") if _is_force(header) else header
 
 
-def _header(name: str) -> _Header:
-    bracketed = None if re.search(r"\[\d+\]$", name) else _BRACKETS.match(name)  # an element of an array
-    base, unit = (bracketed[1], bracketed[2]) if bracketed else (name, "")
-    base = re.sub(r"([a-z])([A-Z])", r"\1_\2", base.strip())
-    base = re.sub(r"[^a-z0-9]+", "_", base.lower()).strip("_")
-    known = UNIT_OF.get(re.sub(r"\s+", "", unit.strip().lower()), UNIT_OF.get(unit.strip().lower(), ""))
-    if not bracketed:
-        words = base.split("_")
-        for count in (3, 2, 1):  # deg_per_s, m_s, ms
-            ending = "_".join(words[-count:])
-            if count < len(words) and ending in UNIT_OF:
-                base, known = "_".join(words[:-count]), UNIT_OF[ending]
-                break
-    if known == "ticks" and not bracketed:
-        base = f"{base}_ticks"
-    if path := _MESSAGE.fullmatch(base) if re.search(r"[./]", name) and "cmd" not in base else None:
-        base = path[1]
-    if not known and "rpm" in base.split("_"):  # rpm_left
-        known = "rpm"
-    sensor = re.match(r"(imu|gps|gnss|odom|robot|wheels)_(?=.)", base)
-    return _Header(name, base[sensor.end() :] if sensor else base, known, sensor[1] if sensor else "")
+def _is_force(header: Header) -> bool:
+    """Whether a column is a specific force whose unit nothing tells."""
+    fields = [field for _, field in guesses(header)]
+    return not header.unit and fields[:1] != [header.column] and "accel_" in "".join(fields)
 
 
-def _guess(header: _Header) -> tuple[str, str] | None:
-    """Channel and field that a column may stand for."""
-    for channel, fields in FIELDS.items():
-        own = header.column in fields and header.column not in TEXT_FIELDS  # whose codes no name tells
-        if own and channel in ("imu", "wheels", "gnss", "motor", "steering"):
-            return channel, header.column
-    for pattern, channel, fields in _PATTERNS:
-        if _OWNER.get(header.sensor, channel) != channel or not re.fullmatch(pattern, header.base):
-            continue
-        for field in fields:
-            fits = not header.unit or header.unit in units_of(field)
-            if fits or (header.unit == "ticks" and field.endswith("_rad")):
-                return channel, field
-    return None
-
-
-def _entry(header: _Header, field: str) -> str:
+def _entry(header: Header, field: str) -> str:
     name = json.dumps(header.column, ensure_ascii=False)
     if field.endswith("_rad") and (header.unit == "ticks" or "tick" in header.base):
-        return f"{{column: {name}, unit: rev, scale: {TICKS}}}"
+        return f"{{column: {name}, unit: rev, scale: {TICKS}{', increments: true' * header.increments}}}"
     if field == "fix":
         codes = {"status_status": "navsatfix", "fix_type": "mavlink"}.get(header.base, "nmea")
         return f"{{column: {name}, unit: {codes}}}"
@@ -355,7 +202,7 @@ def _entry(header: _Header, field: str) -> str:
     return f"{{column: {name}, unit: {header.unit}}}"
 
 
-def _place_entry(header: _Header, cells: Mapping[str, str], field: str) -> str:
+def _place_entry(header: Header, cells: Mapping[str, str], field: str) -> str:
     """The entry of a latitude or longitude beside a column of its hemisphere, or as NMEA writes it; "" for
     another."""
     beside = [name for name, cell in cells.items() if cell.strip() in _HEMISPHERES[field]]
@@ -387,7 +234,8 @@ def _complete(channels: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     elif "front_rad" not in steering:
         steering.pop("rear_rad", None)
     if "latitude_deg" in gnss:
-        found["gnss"] = {name: e for name, e in gnss.items() if name not in ("east_m", "north_m", "up_m")}
+        local = ("east_m", "north_m", "up_m", *ECEF)
+        found["gnss"] = {name: entry for name, entry in gnss.items() if name not in local}
     layout = next((names for names in _WHEELS if set(names) <= set(wheels)), ())
     one = {name: wheels[name] for name in ("speed_mps", YAW_RATE) if "speed_mps" in wheels and name in wheels}
     found["wheels"] = {name: wheels[name] for name in layout} or one
@@ -403,38 +251,42 @@ def _nanoseconds(time: str, names: Sequence[str]) -> str:
     return next((name for name in pairs if name in names), "")
 
 
-def _cell_of_day(header: _Header, cells: Mapping[str, str]) -> bool:
+def _cell_of_day(header: Header, cells: Mapping[str, str]) -> bool:
     return OF_DAY.fullmatch(iso_dates([cells.get(header.column, "")])[0]) is not None
 
 
-def _day(headers: Sequence[_Header], time: _Header, cells: Mapping[str, str]) -> str:
+def _day(headers: Sequence[Header], time: Header, cells: Mapping[str, str]) -> str:
     """The day or GPS week of a time within it, by another column; "" where none tells."""
     others = [(header, cells.get(header.column, "")) for header in headers if header is not time]
-    if _OF_WEEK.search(time.base):
-        weeks = [number_in(cell) for header, cell in others if _WEEK.search(header.base)]
+    if OF_WEEK.search(time.base):
+        weeks = [number_in(cell) for header, cell in others if WEEK.search(header.base)]
         full = [week for week in weeks if week is not None and FULL_WEEK_MIN <= week < 10 * FULL_WEEK_MIN]
         starts = gps_to_unix_ns(np.array(full[:1], dtype=np.int64) * WEEK_S * 10**9)
         return "".join(f"{np.datetime64(int(start), 'ns').astype('datetime64[s]')}Z" for start in starts)
-    dates = iso_dates([cell for header, cell in others if _TIME.search(header.base)])
+    dates = iso_dates([cell for header, cell in others if TIME.search(header.base)])
+    dates = [_NMEA_DATE.sub(r"20\3-\2-\1", date) for date in dates]
     known = [date for date in dates if re.fullmatch(r"\d{4}-\d\d-\d\d", date)]
-    return known[0] if known and _cell_of_day(time, cells) else ""
+    of_day = _cell_of_day(time, cells) or OF_CLOCK.fullmatch(cells.get(time.column, ""))
+    return known[0] if known and of_day else ""
 
 
-def _time_entry(time: _Header, cell: str, rest: str, day: str, step: float) -> str:
+def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[float]) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
     unit, epoch = time.unit or UNIT_OF.get(time.base, ""), "unix"
     unit = unit if unit in TIME_UNITS else ""
     since = f", epoch: {json.dumps(day)}" if day else ""
     value = number_in(cell.removesuffix(" sec").replace(",", "."))
-    if value is None and cell.strip():
+    clocks = bool(OF_CLOCK.fullmatch(cell)) and all(number % 100.0 < 60.0 for number in sample)
+    if (value is None and cell.strip()) or (clocks and (day or "utc" in time.base.split("_"))):
         return f"{{column: {name}, unit: iso8601{since}}}"
     if value is None:
         return f"{{column: {name}, unit: {unit or 's'}, epoch: unix}}"
-    if _OF_WEEK.search(time.base):
+    if OF_WEEK.search(time.base):
         unit = unit or ("ms" if abs(value) > WEEK_S or time.base == "i_tow" else "s")
         return f"{{column: {name}, unit: {unit}{since or ', epoch: none'}}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
     unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "")
+    step = float(np.median(np.diff(sample))) if len(sample) > 1 else 0.0
     if not unit and abs(value) < 0.1 * size["s"] and step == round(step):
         unit = next((known for known in TIME_UNITS if step <= _LONGEST_STEP_S * size[known] * 1e-9), "")
     unit = unit or "s"

@@ -8,12 +8,21 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import pymap3d
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
-from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.channels import Gnss, Wheels
 from terrafusion.datasets.core.conventions import apply
-from terrafusion.datasets.core.decimals import DAY_NS, OF_DAY, NotADecimal, dates_to_ns, iso_dates
+from terrafusion.datasets.core.decimals import (
+    DAY_NS,
+    OF_CLOCK,
+    OF_DAY,
+    NotADecimal,
+    dates_to_ns,
+    iso_dates,
+    month_is_assumed,
+)
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
@@ -26,6 +35,7 @@ from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Requ
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
     DDMM,
+    ECEF,
     EPOCHS,
     GEODETIC,
     TEXT_FIELDS,
@@ -38,9 +48,17 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
     units_of,
 )
+from terrafusion.datasets.readers.text.column_names import header_of
 from terrafusion.datasets.readers.text.fixes import FIX_OF_CODE, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.json_lines import is_json_lines
-from terrafusion.datasets.readers.text.proposed_map import GEAR, TICKS, left_out, starter_map
+from terrafusion.datasets.readers.text.proposed_map import (
+    GEAR,
+    TICKS,
+    TRACK,
+    left_out,
+    second_sensors,
+    starter_map,
+)
 from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
@@ -49,9 +67,17 @@ PACKED = (".csv.gz", ".tsv.gz")
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 
 _OF_HOUR = re.compile(r"\d\d:\d\d\.\d+")
+_DAYS = re.compile(r"^\d+ days? \+?(?=\d)")
+"""In front of the times of day of pandas' differences of times."""
 SHOWN_COLUMNS = 60
 MOST_AT_ONCE = 50
 """So many rows of one time, and no other, are no log."""
+LONG_S = 20.0
+"""No robot that is worth a log stands for so long (assumed)."""
+EARTH_M, FAR_M = 6.37e6, 1e5
+"""Mean radius of the Earth, and how far from it a ground robot is at most."""
+LEAST_ROWS, SHORTEST_STEP_S = 20, 1e-6
+"""So many rows tell how far they are apart; no sensor is read faster."""
 MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
@@ -111,15 +137,26 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
         return DataError(what, remedy=f"export one column for each '{signal}', and one of time")
     if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
         names = [name[:40] for name in names[:SHOWN_COLUMNS]]
-    proposal = starter_map(names, first, columns.units, of_file=path.stem, step=columns.step)
+    proposal = starter_map(names, first, columns.units, of_file=path.stem, sample=columns.sample)
     if names == numbered(len(names)):
         proposal = f"header: none, {proposal}"
         given = f"{', '.join(names)} (first row: {', '.join(first)})"
     else:
         given = ", ".join(filter(None, names))
     open_scales = {TICKS: "how many ticks make a turn?", GEAR: "what is the gear ratio?"}
+    open_scales[TRACK] = "how far apart are the wheels? any distance keeps the yaw rate"
+    if "increments" not in proposal:
+        open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
-    unused = f" and which leaves out {', '.join(rest)}" if (rest := left_out(names, proposal)) else ""
+    headers = [header_of(name) for name in names]
+    for taken, left in second_sensors(headers).items():
+        ask += (
+            f" (of several sensors it takes that of {taken}: for another write its columns, {left[0]}, ...)"
+        )
+    rest = left_out(names, proposal)
+    if strange := [header.column for header in headers if header.strange_unit and header.column not in rest]:
+        ask += f" (the units in {', '.join(strange)} are not known)"
+    unused = f" and which leaves out {', '.join(rest)}" if rest else ""
     return DataError(
         f"nothing says what the columns {given} are",
         remedy=f"correct this proposal, whose fields and units are guesses{ask}{unused} "
@@ -148,7 +185,8 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
-    notes = [*notes, *time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
+    notes += [*time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
+    notes += _standing_note(channels["wheels"], fields.get("wheels", {}))
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
@@ -188,6 +226,7 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
             f"the time of row {int(late[0]) + 1} is {t_ns[late[0]] * 1e-9:.9g} s",
             remedy=f"is the unit {time.unit}?",
         )
+    _check_unit(t_ns, time)
     if time.epoch == "none":
         return t_ns, ["times have no calendar"]
     if time.epoch == "gps":
@@ -198,13 +237,27 @@ def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int
     return t_ns, []
 
 
+def _check_unit(t_ns: TimesNs, time: TimeColumn) -> None:
+    """Refuse times of rows (N,) that are of another kind than numbers in the unit."""
+    span_s = float(np.ptp(t_ns)) * 1e-9 if len(t_ns) > LEAST_ROWS else 0.0
+    step_s = span_s / max(len(t_ns) - 1, 1)
+    if 0.0 < step_s < SHORTEST_STEP_S:
+        what = f"rows are {step_s:.2g} s apart by column '{time.column}'"
+        raise DataError(what, remedy=f"is its unit {time.unit}? write days, as Excel counts them, as dates")
+    if time.unit == "s" and span_s > 200.0 and step_s < 10.0 and (t_ns % (100 * 10**9) < 60 * 10**9).all():
+        what = f"column '{time.column}' holds hours, minutes and seconds such as {t_ns[0] * 1e-9:06.0f}"
+        raise DataError(what, remedy="give it the unit iso8601 in the column map")
+
+
 def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64], list[str]]:
     """Dates with times, or times of day: these begin on the day of the epoch, and go on after midnight.
 
     So do minutes and seconds, as Excel shows times, after each hour.
     """
     texts = columns.texts(time.column).tolist()
-    plain = iso_dates(texts)
+    plain = [_DAYS.sub("", text) for text in iso_dates(texts)]
+    if plain and all(map(OF_CLOCK.fullmatch, plain)):
+        plain = [OF_CLOCK.sub(r"\1:\2:\3", text) for text in plain]
     turn_ns = DAY_NS
     if plain and all(map(_OF_HOUR.fullmatch, plain)):
         plain, turn_ns = [f"00:{text}" for text in plain], DAY_NS // 24
@@ -221,7 +274,10 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
         ) from None
     if not of_day:
         zoned = bool(texts) and re.search(r"(Z|:\S*[+-]\d\d(:?\d\d)?)$", plain[0])
-        return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
+        notes = [] if zoned else ["times without an offset are taken as UTC"]
+        if month_is_assumed(texts):
+            notes += [f"the month is taken first in dates such as {texts[0][:40]}, as beside AM and PM"]
+        return t_ns, notes
     steps = np.diff(t_ns, prepend=t_ns[:1])
     t_ns = t_ns + turn_ns * np.cumsum((steps < -turn_ns // 2).astype(np.int64) - (steps > turn_ns // 2))
     if time.epoch in EPOCHS:
@@ -249,6 +305,8 @@ def _table(
                 values = _degrees(values, of.column)
             if of.hemisphere:
                 values = values * _signs(columns.texts(of.hemisphere)[order], of.hemisphere)
+            if of.increments:
+                values = np.where(np.isnan(values), np.nan, np.nancumsum(values))
             numbers[name] = values if factor == 1.0 else values * factor
             if of.unit == VARIANCE:  # zero and below: the receiver knows none
                 numbers[name] = np.sqrt(np.where(numbers[name] <= 0.0, np.nan, numbers[name]))
@@ -262,6 +320,17 @@ def _table(
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 
+def _standing_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn]) -> list[str]:
+    """A note where the angles of wheels, which have no speeds, stay within a turn: increments do."""
+    if wheels is None or wheels.angle_rad is None or not all(name.endswith("_rad") for name in fields):
+        return []
+    range_rad, span_s = float(np.ptp(wheels.angle_rad, axis=0).max()), np.ptp(wheels.t_ns) * 1e-9
+    if range_rad > 2.0 * math.pi or span_s < LONG_S:
+        return []
+    what = f"wheels: no angle leaves a range of {range_rad:.2g} rad in {span_s:.0f} s"
+    return [f"{what}: of counts that begin again with each row, add increments: true to their entries"]
+
+
 def _degrees(values: Array, column: str) -> Array:
     """Degrees (N,) of numbers such as 4807.5, which are degrees and minutes."""
     degrees = np.trunc(values / 100.0)
@@ -270,6 +339,22 @@ def _degrees(values: Array, column: str) -> Array:
         bad = values[np.flatnonzero(np.abs(minutes) >= 60.0)[0]]
         raise DataError(f"column '{column}' is {bad:.12g}: no minutes", remedy="is its unit deg?")
     return degrees + minutes / 60.0
+
+
+def _geodetic(ecef_m: Array) -> Array:
+    """Latitude (deg), longitude (deg) and height (m) above the ellipsoid (N, 3) of ECEF positions (N, 3).
+
+    NaN where a receiver writes zeros for no position.
+
+    Raises:
+        DataError: a position that is not within 100 km of the ground.
+    """
+    ecef_m = np.where((ecef_m == 0.0).all(axis=1)[:, None], np.nan, ecef_m)
+    radius_m = np.linalg.norm(ecef_m, axis=1)
+    if (far := np.abs(radius_m - EARTH_M) > FAR_M).any():
+        what = f"is {radius_m[far][0]:.4g} m from the centre of the Earth by {', '.join(ECEF)}"
+        raise DataError(what, channel="gnss", remedy="correct the units, or map east_m and north_m")
+    return np.stack(pymap3d.ecef2geodetic(*ecef_m.T), axis=1)
 
 
 def _signs(letters: NDArray[Any], column: str) -> Array:
@@ -305,16 +390,20 @@ class _Reader(ChannelReader):
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}
 
     def _gnss(self, table: TimedTable) -> Gnss | None:
-        for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
-            if (a in table.numbers) != (b in table.numbers):
-                raise DataError(f"has only one of {a} and {b}", channel="gnss", remedy="give both")
-        local = "latitude_deg" not in table.numbers
+        for every in (GEODETIC[:2], ("east_m", "north_m"), ECEF):
+            if 0 < len(present := [name for name in every if name in table.numbers]) < len(every):
+                what = f"has only {', '.join(present)} of {', '.join(every)}"
+                raise DataError(what, channel="gnss", remedy="give all")
+        local = "east_m" in table.numbers
+        position = table.stack(("east_m", "north_m", "up_m") if local else GEODETIC)
+        if ECEF[0] in table.numbers:
+            position = _geodetic(table.stack(ECEF))
         sigma = table.stack(GNSS_SIGMA)
         if "sigma_e_m" in table.numbers and "sigma_u_m" not in table.numbers:
             sigma[:, 2] = UP_FACTOR * sigma[:, :2].max(axis=1)
         fixes = Fixes(
             self._t(table),
-            table.stack(("east_m", "north_m", "up_m") if local else GEODETIC),
+            position,
             self._fix(table),
             sigma,
             table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None,

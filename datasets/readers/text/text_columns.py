@@ -1,6 +1,7 @@
 """Columns of a plain table: of text, and where its header is; of Parquet, by pyarrow, which is optional."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,8 +29,8 @@ from terrafusion.datasets.readers.delimited import (
 )
 from terrafusion.datasets.readers.formats import HEAD_BYTES
 from terrafusion.datasets.readers.text.column_map import ColumnMap
+from terrafusion.datasets.readers.text.column_names import UNIT_OF
 from terrafusion.datasets.readers.text.json_lines import is_json_lines, json_table
-from terrafusion.datasets.readers.text.proposed_map import UNIT_OF
 
 COMMENT = "#"
 SAMPLE_ROWS = 200
@@ -38,6 +39,8 @@ PREFACE_LINES = 60
 """So many lines may stand in front of a header."""
 _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 """What may stand in front of a header for Excel."""
+_THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?")
+_QUOTED_COMMA = re.compile(rb'"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)"')
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
@@ -73,7 +76,7 @@ class TextColumns:
         numbers = [name for name in column_map.columns() if name not in texts]
         self._table = read_columns(self.path, self._text, self._layout, numbers, sorted(texts))
         again = f"the header comes {self._repeated} more times, as of a logger that began anew; left out"
-        self.notes = [*self._table.notes, *(["numbers have decimal commas"] if self._commas else [])]
+        self.notes = [*self._table.notes, *([self._commas] if self._commas else [])]
         self.notes += [again] if self._repeated else []
         self.notes += [f"{counted(self._timeless, 'line')} without a time left out"] if self._timeless else []
         self.notes += (
@@ -87,12 +90,11 @@ class TextColumns:
         columns = range(len(self.names)) if rows else ()
         return [next((r[k] for r in rows if k < len(r) and r[k] not in MISSING), "") for k in columns]
 
-    def step(self, name: str) -> float:
-        """Median step of a column over the first rows; 0 where it holds no numbers."""
+    def sample(self, name: str) -> list[float]:
+        """The numbers of a column in the first rows."""
         k = self.names.index(name)
         cells = [number_in(row[k]) for row in _sample(self._text, self._layout) if len(row) > k]
-        values = [cell for cell in cells if cell is not None]
-        return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+        return [cell for cell in cells if cell is not None]
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
@@ -131,7 +133,9 @@ def _layout(data: bytes, column_map: ColumnMap | None, preface: int) -> TextLayo
     separator = (column_map.separator if column_map else "") or separator_of(header)
     cells = split(header, separator)
     first_line = number + 1
+    numbers = [cell for cell in cells if number_in(cell) is not None]
     named, row = split(comment, separator) if comment else [], all(map(_is_value, cells))
+    row = row or (column_map is None and cells[:1] == numbers[:1] and 2 * len(numbers) > len(cells))
     if column_map is not None and column_map.header == "none":
         cells, first_line = numbered(len(cells)), number
     elif row and len(named) == len(cells):
@@ -180,15 +184,31 @@ def _sample(data: bytes, layout: TextLayout) -> Iterator[list[str]]:
             yield split(line, layout.separator)
 
 
-def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, bool]:
-    """The text with points for decimal commas, and whether it had any: no cell may have a decimal point."""
-    if layout.separator == ",":
-        return data, False
-    cells = [cell for row in _sample(data, layout) for cell in row]
-    if not any(map(_COMMA.fullmatch, cells)) or any(map(_POINT.fullmatch, cells)):
-        return data, False
+def _with_points(data: bytes, layout: TextLayout) -> tuple[bytes, str]:
+    """The text with points for decimal commas, or without commas between thousands, and a note of that.
+
+    Commas are decimal where no cell has a point; between commas as separators, numbers have them in quotes.
+    """
+    quoted = layout.separator == ","
     begin = _begin(data, layout.first_line)
-    return type(data)(data[:begin] + data[begin:].replace(b",", b".")), True
+    head, rows = data[:begin], data[begin:]
+    if b"," not in rows or (quoted and b'"' not in rows):
+        return data, ""
+    cells = [cell for row in _sample(data, layout) for cell in row]
+    points = any(map(_POINT.fullmatch, cells))
+    commas = [cell for cell in cells if _COMMA.fullmatch(cell)]
+    fractions = [cell for cell in commas if not _THOUSANDS.fullmatch(cell.encode())]
+    if commas and not points and (fractions or not quoted):
+        rows = _QUOTED_COMMA.sub(rb"\1.\2", rows) if quoted else rows.replace(b",", b".")
+        return type(data)(head + rows), "numbers have decimal commas"
+    mark = b"" if layout.separator == BLANKS else re.escape(layout.separator.encode())
+    before, after = (b'(?<=")', b'(?=")') if quoted else (b"(?<![^\\s%b])" % mark, b"(?![^\\s%b])" % mark)
+    grouped = re.compile(before + _THOUSANDS.pattern + after)
+    found = grouped.findall(rows)
+    if fractions or not (points or any(b"." in one or one.count(b",") > 1 for one in found)):
+        return data, ""
+    rows, count = grouped.subn(lambda cell: cell[0].replace(b",", b""), rows)
+    return type(data)(head + rows), "numbers have commas between thousands" if count else ""
 
 
 def _units_below(data: bytes, layout: TextLayout) -> tuple[list[str], int]:
@@ -264,9 +284,19 @@ class ParquetColumns:
         """None: the kinds of the columns say what they hold."""
         return []
 
-    def step(self, name: str) -> float:
-        """0: the kinds of the columns say what they hold."""
-        return 0.0
+    def sample(self, name: str) -> list[float]:
+        """The numbers of a column in the first rows."""
+        import pyarrow as pa
+
+        kind = self._file.schema_arrow.field(name).type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+            return []
+        try:
+            batch = next(self._file.iter_batches(SAMPLE_ROWS, columns=[name]), None)
+        except self._refused as error:
+            raise self._damaged(error) from None
+        cells = [] if batch is None else batch.column(0).to_pylist()
+        return [float(cell) for cell in cells if cell is not None and math.isfinite(cell)]
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""

@@ -10,6 +10,7 @@ import pytest
 
 from terrafusion.datasets.checks import run, run_checks
 from terrafusion.datasets.checks.finding import CheckContext, Finding, once
+from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
@@ -130,6 +131,15 @@ def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Record
 def test_held_value_count_is_given(drive: Recording) -> None:
     found = next(f for f in run_checks(held_wheels(drive)) if f.what == "values are held")
     assert "every 4" in found.evidence
+
+
+def test_fixes_held_over_rows_are_found_however_long_the_drive() -> None:
+    t_s = np.arange(0.0, 200.0, 0.1)
+    enu_m = np.stack([np.floor(t_s), 0.0 * t_s, 0.0 * t_s], axis=1)
+    gnss = Gnss((t_s * 1e9).astype(np.int64), enu_m, 0.0 * enu_m + 1.0, np.ones(len(t_s), dtype=np.uint8))
+    (found,) = run_checks(Recording("long", 0, gnss=gnss))
+    assert (found.code, found.channel) == ("held-values", "gnss")
+    assert "every 10" in found.evidence
 
 
 def test_errors_come_first(drive: Recording) -> None:

@@ -246,8 +246,9 @@ def test_value_faults_are_found_and_repaired(drive: Recording, name: str) -> Non
             "of the samples are missing",
         ),
         (rows("imu", lambda t: t < 30.0), "before the other channels"),
+        (rows("gnss", lambda t: t < 30.0), "no fix in the last"),
     ],
-    ids=["a gap", "dropped messages", "a file cut off"],
+    ids=["a gap", "dropped messages", "a file cut off", "a lost fix"],
 )
 def test_what_is_missing_stays_missing(drive: Recording, corrupt: Corrupt, words: str) -> None:
     corrupted = corrupt(drive)
@@ -256,6 +257,7 @@ def test_what_is_missing_stays_missing(drive: Recording, corrupt: Corrupt, words
     assert words in finding.what
     assert finding.repair is None
     assert "dropped messages" in finding.fix
+    assert ("lost its satellites" in finding.fix) == (finding.channel == "gnss")
     assert repair(corrupted) == (corrupted, [])
 
 

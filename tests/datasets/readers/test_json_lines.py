@@ -71,7 +71,8 @@ def test_a_line_that_is_no_object_is_named(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "head", "hint"),
-    [("drive.zip", b"PK\x03\x04", "unpack it"), ("a.json", b'[\n{"t": 0}]', "one object a line"),
+    [("drive.zip", b"PK\x03\x04", "unpack it"), ("a.xlsx", b"PK\x03\x04", "export it as a table"),
+     ("a.json", b'[\n{"t": 0}]', "one object a line"),
      ("a.ulg", b"ULog\x01", "ulog2csv")],
 )  # fmt: skip
 def test_files_that_need_a_step_first_are_refused_with_it(

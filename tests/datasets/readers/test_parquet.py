@@ -61,6 +61,15 @@ def test_bad_parquet(tmp_path: Path, columns: dict[str, Any], match: str) -> Non
         open_recording(parquet(tmp_path, columns))
 
 
+def test_numbers_of_parquet_tell_what_is_proposed(tmp_path: Path) -> None:
+    """A heading in degrees is no yaw in radians, as in text."""
+    places = {"x": [0.0, 1.0], "y": [0.0, 0.0], "heading": [359.0, 1.0]}
+    path = parquet(tmp_path, {"t": [0.0, 1.0], **places})
+    path.with_name(path.name + ".columns.yaml").unlink()
+    with pytest.raises(DataError, match=r'leaves out heading .*truth: \{x_m: "x", y_m: "y"\}'):
+        open_recording(path)
+
+
 def test_damaged_parquet(tmp_path: Path) -> None:
     path = parquet(tmp_path, {"t": [0.0], "wz": [1.0]})
     whole = path.read_bytes()

@@ -174,6 +174,33 @@ def test_wheels_of_one_robot_are_not_joined_with_the_imu_of_its_twin(tmp_path: P
     assert set(open_recording(write_ros2(tmp_path / "one", messages)).channels()) == {"imu", "wheels"}
 
 
+@pytest.mark.parametrize(
+    ("imu", "wheels", "robots"),
+    [
+        ("/husky/imu", "/jackal/odom", 2),
+        ("/husky/imu/data", "/jackal/wheel/odom", 2),
+        ("/husky/imu", "/husky/odom", 1),
+        ("/vectornav/imu", "/husky_velocity_controller/odom", 1),
+        ("/imu/data", "/husky/odom", 1),
+        ("/imu", "/husky/odom", 1),
+    ],
+)
+def test_namespaces_that_name_no_sensor_may_be_robots(
+    tmp_path: Path, imu: str, wheels: str, robots: int
+) -> None:
+    path = write_ros2(tmp_path / "bag", [*imu_messages(MAKE2, imu), *odometry_messages(MAKE2, wheels)])
+    if robots == 2:
+        with pytest.raises(
+            DataError, match=f"of one robot: --topic imu={imu} --topic wheels={wheels}; of se"
+        ):
+            open_recording(path)
+        alone = open_recording(path, topics={"wheels": wheels})
+        assert set(alone.channels()) == {"wheels"}
+        assert any("not used: /husky/, as of other robots" in note for note in alone.notes)
+    both = open_recording(path, topics={"wheels": wheels, "imu": imu} if robots == 2 else None)
+    assert set(both.channels()) == {"imu", "wheels"}
+
+
 def bag_beside_imu(path: Path, topic: str, msgtype: str, *messages: Any) -> Path:
     """An IMU and another topic, at 20 Hz."""
     found = [(topic, msgtype, T0 + k * 50_000_000, message) for k, message in enumerate(messages)]

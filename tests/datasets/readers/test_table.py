@@ -39,6 +39,7 @@ def ns(text: str) -> int:
 
 EXACT = {
     ("gyro_z_radps", "deg/s"): (180.0, np.pi),
+    ("gyro_z_radps", "mdeg/s"): (180e3, np.pi),
     ("gyro_z_radps", "rpm"): (30.0, np.pi),
     ("gyro_z_radps", "rev/s"): (0.5, np.pi),
     ("accel_z_mps2", "g"): (1.0, 9.80665),
@@ -326,7 +327,7 @@ WRONG_MAPS = {
     ),
     "both positions": (
         "time: {column: t}\nchannels: {gnss: {latitude_deg: t, longitude_deg: t, east_m: t, north_m: t}}",
-        "either latitude",
+        "one of: latitude_deg, longitude_deg \\| east_m, north_m \\| ecef_x_m",
     ),
     "no mapping": ("- a\n", "mapping"),
     "a list for a column": (GYRO_MAP.replace("wz}", "[wz]}"), "not a section"),
@@ -438,5 +439,5 @@ def test_a_comment_mark_inside_a_cell_is_no_comment(tmp_path: Path) -> None:
 
 
 def test_half_a_position_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="only one of latitude_deg and longitude_deg"):
+    with pytest.raises(DataError, match="only latitude_deg of latitude_deg, longitude_deg; give all"):
         open_recording(table(tmp_path, "t_s,latitude_deg,gyro_z_radps\n0,48.0,0.1\n1,48.0,0.1\n", None))

@@ -318,25 +318,70 @@ def test_the_speed_of_motors_is_proposed_with_a_gear_ratio_to_fill_in(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("names", "fields"),
+    ("text", "rpm", "said"),
     [
-        ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
-        ("odo_speed,forward_velocity", ["speed_mps"]),
-        ("x_utm,y_utm", ["east_m", "north_m"]),
-        ("E,N", ["east_m", "north_m"]),
-        ("Easting [m],Northing [m],N", ["east_m", "north_m"]),
-        ("E,count", []),
+        ('t,gz,left_rpm,right_rpm\n0,1,999.5,"1,999.5"\n1,234,567,"1,000"\n', [999.5, 1999.5], "thousands"),
+        ('t,gz,left_rpm,right_rpm\n0,1,"-1,234,567",2\n', [-1234567, 2], "thousands"),
+        ("t;gz;left_rpm;right_rpm\n0;1;999.5;1,999.5\n1;2; 3,000;4\n", [999.5, 1999.5], "thousands"),
+        ('t,gz,left_rpm,right_rpm\n0,"1,5","0,25","1,125"\n', [0.25, 1.125], "decimal commas"),
+        ("t;gz;left_rpm;right_rpm\n0;1;2,125;1,125\n", [2.125, 1.125], "decimal commas"),
     ],
 )
-def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields: list[str]) -> None:
-    proposal = starter_map(["t", "gz", *names.split(",")])
-    found = [
-        name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
-    ]
-    assert found == fields
+def test_commas_between_thousands_or_for_points(
+    text: str, rpm: list[float], said: str, tmp_path: Path
+) -> None:
+    found = proposed(tmp_path, text)
+    assert found.wheels is not None
+    np.testing.assert_allclose(found.wheels.speed[0], np.pi / 30.0 * np.array(rpm))
+    assert sum(said in note for note in found.notes) == 1
 
 
-def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:
-    names = ["t", "lat", "lon", "fix_type"]
-    assert "mavlink" in starter_map(names, ["0", "48.1", "11.5", "6"])
-    assert "fix" not in starter_map(names, ["0", "48.1", "11.5", "RTK_FIXED"])
+def test_a_comma_that_may_be_either_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"column 'right_rpm' is '1,125' at line 2"):
+        proposed(tmp_path, 't,gz,left_rpm,right_rpm\n0,1,2,"1,125"\n')
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "start"),
+    [
+        ("utc_time,date", "235959.5,010524 000000.0,020524", "2024-05-01T23:59:59.5"),
+        ("utc,gx", "93015.25,0 93016.0,0", "1970-01-01T09:30:15.25"),
+        ("time,gx", "0_days_23:59:59.500000,0 1_days_00:00:00,0", "1970-01-01T23:59:59.5"),
+    ],
+)
+def test_times_of_day_without_colons_and_of_pandas(names: str, rows: str, start: str, tmp_path: Path) -> None:
+    lines = "".join(f"{row.replace('_', ' ')},1\n" for row in rows.split(" "))
+    imu = proposed(tmp_path, f"{names},gz\n{lines}").imu
+    assert imu is not None
+    assert imu.t_ns[0] == np.datetime64(start, "ns").astype(np.int64)
+    assert 0 < imu.t_ns[1] - imu.t_ns[0] < 10**9
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([45413.5 + k / 86400e2 for k in range(30)], r"rows are 1.2e-07 s apart.*as Excel counts them"),
+        (
+            [120000 + 100 * (k // 60) + k % 60 for k in range(300)],
+            "seconds such as 120000; give it the unit iso",
+        ),
+    ],
+)
+def test_times_that_are_no_seconds_are_refused(times: list[float], said: str, tmp_path: Path) -> None:
+    rows = "".join(f"{t:.9f},1\n" for t in times)
+    path = table(
+        tmp_path,
+        f"clock,gz\n{rows}",
+        "time: {column: clock, epoch: none}\nchannels: {imu: {gyro_z_radps: gz}}",
+    )
+    with pytest.raises(DataError, match=said):
+        open_recording(path)
+
+
+def test_a_first_row_with_a_word_in_it_is_no_header(tmp_path: Path) -> None:
+    """So does `ros2 topic echo --csv` write messages."""
+    (path := tmp_path / "drive.csv").write_text("1714564800,5,imu_link,0.1\n1714564801,5,imu_link,0.2\n")
+    with pytest.raises(
+        DataError, match=r"columns 1, 2, 3, 4 \(first row: 1714564800, 5, imu_link.*header: none"
+    ):
+        open_recording(path)

@@ -7,9 +7,10 @@ from operator import xor
 from pathlib import Path
 
 import numpy as np
+import pymap3d
 import pytest
 
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 
@@ -154,6 +155,15 @@ def test_a_date_that_is_not_clear_is_refused(date: str, tmp_path: Path) -> None:
         opened_as_proposed(tmp_path, f"time,gyro_z\n{date},1\n")
 
 
+@pytest.mark.parametrize("date", ["05/01/2024 12:00:00.5 PM", "5/1/2024 12:00 pm", "4/30/2024 12:00:00.5 PM"])
+def test_the_month_is_first_beside_am_and_pm_and_that_is_said(date: str, tmp_path: Path) -> None:
+    found = opened_as_proposed(tmp_path, f"time,gyro_z\n{date},1\n")
+    clear = "30" in date
+    day = "2024-04-30" if clear else "2024-05-01"
+    assert found.start_ns // 10**9 == np.datetime64(f"{day}T12:00:00").astype(int)
+    assert any(f"the month is taken first in dates such as {date}" in note for note in found.notes) != clear
+
+
 def test_a_column_that_gives_all_rows_one_time_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path, "t,day,gyro_z\n" + "2020-09-13,5,1\n" * 60)
     path.with_name("log.csv.columns.yaml").write_text(
@@ -190,11 +200,17 @@ def test_variances_of_fixes_are_proposed(end: str, tmp_path: Path) -> None:
 )
 def test_speed_and_yaw_rate_are_the_sides_of_the_odometrys_track(names: str, tmp_path: Path) -> None:
     text = f"{names}\n0,1.0,0.5\n1,2.0,-0.5\n"
-    with pytest.raises(DataError, match=r"wheels: speed and yaw rate need the track; give track_m"):
-        opened_as_proposed(tmp_path, text)
-    wheels = opened_as_proposed(tmp_path, text, track_m=0.6).wheels
+    wheels = opened_as_proposed(tmp_path, text).wheels
+    assert wheels is not None
+    np.testing.assert_allclose(wheels.speed, [[0.75, 1.25], [2.25, 1.75]])
+    columns = tmp_path / "drive.csv.columns.yaml"
+    columns.write_text((proposed := columns.read_text()).replace("track_m: 1,", "track_m: 0.6,"))
+    wheels = open_recording(tmp_path / "drive.csv").wheels
     assert wheels is not None
     np.testing.assert_allclose(wheels.speed, [[0.85, 1.15], [2.15, 1.85]])
+    columns.write_text(proposed.replace("track_m: 1,", ""))
+    with pytest.raises(DataError, match=r"wheels: speed and yaw rate need the track; give track_m"):
+        open_recording(tmp_path / "drive.csv")
 
 
 def test_a_first_line_of_numbers_is_no_header(tmp_path: Path) -> None:
@@ -211,13 +227,80 @@ def test_nanoseconds_beyond_a_second_are_refused(tmp_path: Path) -> None:
         opened_as_proposed(tmp_path, text)
 
 
-def opened_as_proposed(folder: Path, text: str, **keys: float) -> Recording:
+@pytest.mark.parametrize(
+    "names", ["delta_left_ticks,delta_right_ticks", "dEncL,dEncR", "l_enc_inc,r_enc_inc"]
+)
+def test_ticks_of_each_row_are_added_up(names: str, tmp_path: Path) -> None:
+    wheels = opened_as_proposed(tmp_path, f"t,{names}\n0,7,7\n0.1,512,256\n0.2,,\n0.3,512,256\n").wheels
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    np.testing.assert_allclose(np.diff(wheels.angle_rad, axis=0), [[np.pi, np.pi / 2]])
+
+
+def test_ticks_of_each_row_that_are_taken_for_angles_are_noted(tmp_path: Path) -> None:
+    text = "t,left_ticks,right_ticks\n" + "".join(f"{k},{30 + abs(k % 14 - 7)},30\n" for k in range(40))
+    notes = opened_as_proposed(tmp_path, text).notes
+    assert any(
+        "no angle leaves a range of 0.043 rad in 38 s" in note and "increments" in note for note in notes
+    )
+    columns = tmp_path / "drive.csv.columns.yaml"
+    assert "increments" not in columns.read_text()
+    columns.write_text(columns.read_text().replace("1/1024", "1/1024, increments: true"))
+    assert not any("no angle leaves" in note for note in open_recording(tmp_path / "drive.csv").notes)
+    columns.write_text("{time: t, channels: {imu: {gyro_z_radps: {column: left_ticks, increments: true}}}}")
+    with pytest.raises(ConfigError, match="only angles of wheels come as increments"):
+        open_recording(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize("names", ["ecef_x,ecef_y,ecef_z", "ecefX [cm],ecefY [cm],ecefZ [cm]", "x,y,z"])
+def test_earth_centred_positions_are_fixes(names: str, tmp_path: Path) -> None:
+    """Of a table of x, y, z they were the truth of a robot 6 000 km from its origin."""
+    scale = 100.0 if "cm" in names else 1.0
+    places = [pymap3d.geodetic2ecef(48.1, 11.5 + 1e-4 * k, 500.0) for k in range(3)]
+    rows = "".join(
+        f"{k},{','.join(f'{value * scale:.3f}' for value in one)}\n" for k, one in enumerate(places)
+    )
+    recording = opened_as_proposed(tmp_path, f"t,{names}\n{rows}3,0,0,0\n")
+    assert recording.truth is None
+    assert recording.gnss is not None
+    east = [pymap3d.geodetic2enu(48.1, 11.5 + 1e-4 * k, 500.0, 48.1, 11.5, 500.0)[0] for k in range(3)]
+    np.testing.assert_allclose(recording.gnss.enu_m[:, 0], east, atol=2e-3)
+    assert recording.datum == pytest.approx((48.1, 11.5, 500.0), abs=1e-2)
+    columns = tmp_path / "drive.csv.columns.yaml"
+    columns.write_text(columns.read_text().replace("unit: cm", "unit: m"))
+    if "cm" in names:
+        with pytest.raises(DataError, match=r"6\.3\d+e\+08 m from the centre of the Earth by ecef_x_m"):
+            open_recording(tmp_path / "drive.csv")
+
+
+def test_zeros_in_most_rows_are_no_fixes(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{'48.1,11.5' if k % 5 == 3 else '0.0,0.0'}\n" for k in range(20))
+    found = opened_as_proposed(tmp_path, f"t,lat,lon\n{rows}")
+    assert found.gnss is not None
+    assert found.gnss.enu_m[:, :2].tolist() == [[0.0, 0.0]] * 4
+    assert any("16 of 20 rows hold no fix; left out" in note for note in found.notes)
+
+
+def test_headings_in_degrees_are_no_yaw_in_radians(tmp_path: Path) -> None:
+    """A heading in degrees is a compass's, clockwise from north; the yaw of a pose keeps its sense."""
+    rows = "0,0,0,{0}\n1,1,0,{1}\n"
+    truth = opened_as_proposed(tmp_path, "t,x,y,yaw\n" + rows.format(90, 45)).truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.quaternion, [[0, 0, 0.5**0.5, 0.5**0.5], [0, 0, 0.38268343, 0.92387953]])
+    truth = opened_as_proposed(tmp_path, "t,x,y,heading\n" + rows.format(1.5, 1.6)).truth
+    assert truth is not None
+    assert truth.quaternion is not None
+    truth = opened_as_proposed(tmp_path, "t,x,y,heading\n" + rows.format(350.0, 3.0)).truth
+    assert truth is not None
+    assert truth.quaternion is None
+
+
+def opened_as_proposed(folder: Path, text: str) -> Recording:
     """A table, opened by the map that the error without one proposes."""
     path = folder / "drive.csv"
     path.write_text(text)
     (columns := folder / "drive.csv.columns.yaml").unlink(missing_ok=True)
     with pytest.raises(DataError) as told:
         open_recording(path)
-    given = "".join(f"{key}: {value}, " for key, value in keys.items())
-    columns.write_text("{" + given + str(told.value).split(".columns.yaml: {", 1)[1])
+    columns.write_text("{" + str(told.value).split(".columns.yaml: {", 1)[1])
     return open_recording(path)

@@ -207,6 +207,8 @@ def test_a_magnetometer_that_is_not_there_is_missed(log: tf.Recording) -> None:
 def test_a_recording_is_open_already(log: tf.Recording) -> None:
     with pytest.raises(tf.DataError, match="a Recording is no path of a log"):
         tf.open(log)  # type: ignore[arg-type]
+    with pytest.raises(tf.DataError, match=r"drive\.csv: columns is 3; give the path of a column map"):
+        tf.open("drive.csv", columns=3)
 
 
 def test_a_car_of_unknown_wheelbase_says_so() -> None:
