@@ -74,6 +74,8 @@ def live(
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
         grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, written at the end.
     """
+    if log is not None:
+        common.check_existence(log)
     from terrafusion.fusion.live.options import LiveOptions
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
