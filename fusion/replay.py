@@ -21,7 +21,7 @@ from terrafusion.fusion.estimator.imu_level import ImuLevel
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.fusion.grounds.memory import GroundMemory, after_drive, drive_mark
 from terrafusion.fusion.metrics.baselines import Baselines, baselines
 from terrafusion.fusion.metrics.judged_run import Run
 from terrafusion.fusion.metrics.scores import Outage, Scores, score
@@ -107,7 +107,7 @@ def replay(
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
     """
-    wheels_of(recording)  # refused before a vehicle is asked for
+    wheels = wheels_of(recording)  # refused before a vehicle is asked for
     params, vehicle_notes = choose_vehicle(recording, vehicle)
     used, held_out = split_fixes(recording, outages)
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
@@ -127,6 +127,14 @@ def replay(
         notes += ("the log has no magnetometer: none is used",)
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
+    learned, mark = estimator.weights.learned_grounds(), drive_mark(wheels)
+    if learned is not None:
+        learned = after_drive(grounds, learned, mark)
+    if grounds is not None and mark in grounds.drives:
+        notes += (
+            "the ground memory has learned from this drive before: it is not counted again, and outages are "
+            "bridged as on ground that is known",
+        )
     changes = [*history.changes, *estimator.weights.take_changes()]
     estimate = history.estimate(estimator.weights.detector.classes, changes, notes, recording.start_ns)
 
@@ -138,7 +146,7 @@ def replay(
     return ReplayResult(
         recording, params, mode, config.policy, estimate, scores, used, held_out, outages, seconds,
         latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, alone, verdict, assumed,
-        estimator.learned.table(), estimator.weights.learned_grounds(), estimator.weights.found_shares(),
+        estimator.learned.table(), learned, estimator.weights.found_shares(),
     )  # fmt: skip
 
 

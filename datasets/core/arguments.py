@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from numbers import Integral
+from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
@@ -28,3 +29,14 @@ def checked_whole(value: Any, what: str, least: int = 0) -> int:
     if not isinstance(value, Integral) or value < least:
         raise ConfigError(f"'{what}' is {value!r}", remedy=f"give a whole number from {least}")
     return int(value)
+
+
+def checked_path(value: Any, what: str) -> Path:
+    """A file or folder to write.
+
+    Raises:
+        ConfigError: it is no path.
+    """
+    if not isinstance(value, str | Path):
+        raise ConfigError(f"'{what}' is {value!r}", remedy="give a path")
+    return Path(value)

@@ -7,7 +7,7 @@ policy = terrafusion.policy.fit("policy.yaml", seeds=3)  # from drives of the tw
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from terrafusion.datasets.core.arguments import checked_whole
+from terrafusion.datasets.core.arguments import checked_path, checked_whole
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 from terrafusion.fusion.noise.policy import load_policy as load
 
@@ -41,8 +41,9 @@ def fit(
     from terrafusion.fusion.training.policy_logs import read_logs
     from terrafusion.fusion.training.simulated_runs import GROUNDS
 
+    file = checked_path(out, "out")
     checked_whole(seeds, "seeds", 1)
     logged = read_logs([str(log) for log in logs], vehicle) if logs else LoggedSamples()
     fitted = fit_policy(default_grid(seeds, tuple(GROUNDS), vehicle), progress or (lambda: None), logged)
-    write_policy(fitted, Path(out), made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")
-    return load(Path(out))
+    write_policy(fitted, file, made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")
+    return load(file)

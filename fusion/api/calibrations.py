@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from terrafusion.datasets.core.arguments import checked_path
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.outputs.robot_file import write_robot
 from terrafusion.fusion.sensor_calibration import SensorCalibration
@@ -17,7 +18,7 @@ class LearnedSensors(SensorCalibration):
 
     def write(self, path: str | Path) -> Path:
         """Write the vehicle file, for `vehicle=` everywhere; see `robot_file.write_robot`."""
-        return write_robot(Path(path), self)
+        return write_robot(checked_path(path, "path"), self)
 
 
 def calibrate_sensors(

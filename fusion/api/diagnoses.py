@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 
-from terrafusion.datasets.core.arguments import checked_names, checked_whole
+from terrafusion.datasets.core.arguments import checked_names, checked_path, checked_whole
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
@@ -34,8 +34,9 @@ class Diagnosis(GapDiagnosis):
         Raises:
             TerrafusionError: the folder cannot be written.
         """
-        write_diagnosis(Path(out), self)
-        return Path(out) / "report.html"
+        folder = checked_path(out, "out")
+        write_diagnosis(folder, self)
+        return folder / "report.html"
 
     def __repr__(self) -> str:
         return "\n".join(answer(self))

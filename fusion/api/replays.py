@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.arguments import checked_path
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
@@ -38,8 +39,9 @@ class Replay(ReplayResult):
         Raises:
             TerrafusionError: the folder cannot be written.
         """
-        write_replay(Path(out), self)
-        return Path(out) / "report.html"
+        folder = checked_path(out, "out")
+        write_replay(folder, self)
+        return folder / "report.html"
 
     def __repr__(self) -> str:
         lines = [

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.datasets.core.errors import DataError, errors_of
-from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.usage import refuse_options
@@ -75,6 +74,8 @@ def live(
         terrain_model (FILE.yaml): Model of this robot's grounds, of `terrain train`.
         grounds (FILE.yaml): What the robot learned of its grounds: read if it is there, written at the end.
     """
+    if log is not None:
+        common.check_existence(log)
     from terrafusion.fusion.live.options import LiveOptions
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
@@ -132,8 +133,6 @@ def _run_robot(
     begun = time.monotonic()
     serve(bus, node, lambda: bool(stopped) or (seconds is not None and time.monotonic() - begun >= seconds))
     say(_summary(node))
-    if options.grounds is not None and options.grounds.exists():
-        say(f"the ground memory is in {options.grounds}")
     bus.close()
     if view is not None:
         view.close()
@@ -159,8 +158,10 @@ def _domain(domain: int | None) -> int:
 def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
     """A recording message by message, odometry after every IMU sample."""
     from terrafusion.datasets.readers import open_recording
+    from terrafusion.fusion.estimator.feed import wheels_of
     from terrafusion.fusion.estimator.history import History
     from terrafusion.fusion.grounds.file import read_grounds, save_grounds
+    from terrafusion.fusion.grounds.memory import after_drive, drive_mark
     from terrafusion.fusion.live.loop import live_estimator, run, verdict_of
 
     recording = open_recording(
@@ -185,8 +186,7 @@ def _run_log(log: str, options: LiveOptions, realtime: bool) -> None:
             print(line)
     learned = estimator.weights.learned_grounds()
     if options.grounds is not None and learned is not None:
-        save_grounds(learned, options.grounds)
-        print(f"{counted(len(learned), 'ground')} of '{learned.robot}' to {options.grounds}")
+        print(save_grounds(after_drive(memory, learned, drive_mark(wheels_of(recording))), options.grounds))
     state = newest[0]
     print(f"{state.status}: {state.position_m.round(2).tolist()} m, slip {state.slip:.2f}")
     for line in verdict_of(estimator, history, recording).lines():

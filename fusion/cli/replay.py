@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.datasets.core.errors import ConfigError, errors_of
-from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.cli import common
 from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.outputs import Output
@@ -112,8 +111,8 @@ def replay(
             settings={"calibrate": calibrate, "declination_rad": turned, "terrain_model": model},
             grounds=memory, findings=findings, progress=progress,
         )  # fmt: skip
-    unseen = _write(result, out, mcap, rerun, grounds)
-    return _shown(result, findings, unseen, out, grounds)
+    unseen, done = _write(result, out, mcap, rerun, grounds)
+    return _shown(result, findings, unseen, out, done)
 
 
 def _outage(text: str) -> Outage:
@@ -128,30 +127,28 @@ def _outage(text: str) -> Outage:
 
 def _write(
     result: ReplayResult, out: Path, mcap: bool, rerun: Path | None, grounds: Path | None
-) -> list[str]:
-    """All files of a replay; returns lines on what the bag could not hold."""
+) -> tuple[list[str], str]:
+    """All files of a replay; returns lines on what the bag could not hold, and what was written."""
     from terrafusion.fusion.grounds.file import save_grounds
     from terrafusion.fusion.reports.replay import write_replay
     from terrafusion.fusion.reports.rerun_log import write_rerun
 
+    done = f"written to {out}"
     if grounds is not None and result.grounds is not None:
-        save_grounds(result.grounds, grounds)
+        done += f"; {save_grounds(result.grounds, grounds)}"
     write_replay(out, result, {"command": common.command_line()})
     unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
-    return unseen
+    return unseen, done
 
 
 def _shown(
-    result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[str], out: Path, grounds: Path | None
+    result: ReplayResult, findings: Sequence[Finding], unseen: Sequence[str], out: Path, done: str
 ) -> Result:
     """What the command prints, the verdict first."""
     warnings = [_warning(finding, result.learned) for finding in findings]
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
-    done = f"written to {out}"
-    if grounds is not None and result.grounds is not None:
-        done += f"; {counted(len(result.grounds), 'ground')} of '{result.grounds.robot}' to {grounds}"
     short = f"{result.verdict.lines()[0]}; {done}"
     return Result(lines, done, common.read_json(out / "metrics.json"), short=short, vehicle=result.vehicle)
 

@@ -154,7 +154,7 @@ class EstimatorConfig:
             if value not in known:
                 raise ConfigError(f"unknown {what} '{value}'", remedy=f"this version has {', '.join(known)}")
         for key, range_ in _RANGES.items():
-            if (value := getattr(self, key)) is not None:
+            if (value := getattr(self, key)) is not None or key != "declination_rad":
                 checked_number(value, range_, file="the estimator", key=key)
         if self.lag_s < 5 * self.keyframe_s:
             raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

@@ -248,11 +248,12 @@ class Estimator:
         """The newest state carried to the newest IMU sample, in the frame "map", or "odom" in which no fix
         makes the path jump (`OdometryFrame`); None before the start.
         """
+        as_in_map = in_map(frame)
         if self._state is None or self._carried is None:
             return None
         covariance, noise = self._carried
         now = self._propagator.carry(self._state, covariance, self.imu, noise)
-        return now if in_map(frame) else self._frame.of(self._state, now)
+        return now if as_in_map else self._frame.of(self._state, now)
 
     def dump(self) -> bytes:
         """The state of a running estimator, for `restore`; see `snapshot`."""

@@ -10,6 +10,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.datasets.core.yaml_file import dump_yaml, read_yaml
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, MOST_SLIP, Ground, Tally
@@ -17,6 +18,8 @@ from terrafusion.fusion.grounds.memory import MOST_GROUNDS, GroundMemory
 from terrafusion.fusion.grounds.signature import SIGNATURE
 
 SCHEMA = "terrafusion.grounds/1"
+GENERIC = "generic"
+"""Vehicle of a log that names none."""
 _SHARE = Quantity("", 0.0, 1.0)
 
 
@@ -52,6 +55,7 @@ class GroundsFile:
     schema: Annotated[str, Word((SCHEMA,))]
     robot: str
     grounds: tuple[GroundFile, ...]
+    drives: tuple[str, ...] = ()
 
 
 def load_grounds(path: Path) -> GroundMemory:
@@ -85,7 +89,7 @@ def load_grounds(path: Path) -> GroundMemory:
                     file=path,
                     remedy="give a share, -1 to 1, not per cent",
                 )
-    return GroundMemory([_ground(g) for g in content.grounds], content.robot)
+    return GroundMemory([_ground(g) for g in content.grounds], content.robot, content.drives)
 
 
 def read_grounds(path: Path) -> GroundMemory:
@@ -93,10 +97,15 @@ def read_grounds(path: Path) -> GroundMemory:
     return load_grounds(path) if path.exists() else GroundMemory()
 
 
-def save_grounds(memory: GroundMemory, path: Path) -> None:
-    """Write a memory: same memory, same bytes."""
+def save_grounds(memory: GroundMemory, path: Path) -> str:
+    """Write a memory: same memory, same bytes. Returns what was written, in words."""
     content = {"schema": SCHEMA, "robot": memory.robot, "grounds": [_written(g) for g in memory.grounds]}
+    content |= {"drives": list(memory.drives)} if memory.drives else {}
     dump_yaml(path, content, default_flow_style=None)
+    done = f"{counted(len(memory), 'ground')} of '{memory.robot}' to {path}"
+    if memory.robot not in ("", GENERIC):
+        return done
+    return f"{done} (so every robot without a vehicle file is called: keep a file a robot, or give --vehicle)"
 
 
 def _ground(content: GroundFile) -> Ground:

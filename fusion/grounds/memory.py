@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.printable import counted
 from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground, is_given
 from terrafusion.fusion.grounds.signature import FELT, SIGNATURE
@@ -33,6 +34,7 @@ TEMPER = 0.6
 DWELL = 8
 """Windows in a row that new ground takes: 4 s."""
 MOST_GROUNDS = 12
+MOST_DRIVES = 1000
 ALIKE = 0.5
 """Mean squared distance of two signatures, in their spreads, below which they are one ground."""
 LEAST_WINDOWS = 30.0
@@ -46,12 +48,13 @@ class GroundMemory:
     Attributes:
         grounds: in the order in which they were met.
         robot: name or type of the robot, "" where not known.
+        drives: marks of the drives that are counted (`drive_mark`), the newest `MOST_DRIVES`.
         left_out: windows on new ground for which there was no place.
     """
 
-    def __init__(self, grounds: Sequence[Ground] = (), robot: str = "") -> None:
+    def __init__(self, grounds: Sequence[Ground] = (), robot: str = "", drives: Iterable[str] = ()) -> None:
         self.grounds: list[Ground] = list(grounds)
-        self.robot = robot
+        self.robot, self.drives = robot, tuple(dict.fromkeys(drives))[-MOST_DRIVES:]
         self._belief: list[float] = self._prior().tolist()
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
@@ -85,7 +88,7 @@ class GroundMemory:
 
     def copy(self) -> "GroundMemory":
         """The same grounds, at the begin of a drive."""
-        return GroundMemory(self.grounds, self.robot)
+        return GroundMemory(self.grounds, self.robot, self.drives)
 
     def _prior(self) -> Array:
         k = len(self.grounds)
@@ -203,7 +206,7 @@ class GroundMemory:
             name = names.get(ground.name, ground.name)
             other = dataclasses.replace(ground, name=name)
             found[name] = found[name].merged(other) if name in found else other
-        return GroundMemory(list(found.values()), self.robot)
+        return GroundMemory(list(found.values()), self.robot, self.drives)
 
     def condensed(self) -> "GroundMemory":
         """With grounds merged that look alike; without those of which too little was seen, or of which too
@@ -218,7 +221,7 @@ class GroundMemory:
                 kept.append(ground)
             else:
                 kept[twin] = kept[twin].merged(ground)
-        return GroundMemory(kept[:MOST_GROUNDS], self.robot)
+        return GroundMemory(kept[:MOST_GROUNDS], self.robot, self.drives)
 
 
 def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
@@ -242,7 +245,20 @@ def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
                 name, i = f"ground {i}", i + 1
             names.add(name)
             grounds.append(dataclasses.replace(ground, name=name))
-    return GroundMemory(grounds, next((m.robot for m in found if m.robot), "")).named({}).condensed()
+    robot, drives = next((m.robot for m in found if m.robot), ""), [d for m in found for d in m.drives]
+    return GroundMemory(grounds, robot, drives).named({}).condensed()
+
+
+def drive_mark(wheels: Wheels) -> str:
+    """Mark of a drive: of its wheel speeds and their times, which no option of a replay changes."""
+    return hashlib.sha256(wheels.t_ns.tobytes() + wheels.speed.tobytes()).hexdigest()[:16]
+
+
+def after_drive(before: GroundMemory | None, learned: GroundMemory, mark: str) -> GroundMemory:
+    """What a memory `learned` in a drive; as it was `before`, where that has counted the drive already."""
+    if before is not None and mark in before.drives:
+        return before
+    return GroundMemory(learned.grounds, learned.robot, (*learned.drives, mark))
 
 
 def alike(a: Ground, b: Ground) -> bool:

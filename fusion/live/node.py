@@ -183,7 +183,7 @@ class LiveNode:
             self.estimator.finish()
             learned = self.estimator.weights.learned_grounds()
             if self.options.grounds is not None and learned is not None:
-                save_grounds(learned, self.options.grounds)
+                self._say(save_grounds(learned, self.options.grounds))
 
     def _begin_ordering(self) -> None:
         self._ordered = OrderedSamples(self.options.wait_s)

@@ -85,4 +85,4 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     verdict = "observed" if row["observed"] else "not observable on this drive"
     if row.get("corrects"):
         verdict = "observed, corrects the sensor"
-    return [f"{label}, {unit}", *numbers, verdict]
+    return [f"{label}, {unit}" if unit else label, *numbers, verdict]

@@ -193,7 +193,7 @@ def summary_of_one(metrics: Metrics) -> list[str]:
     sentences += [_outage_sentence(outage) for outage in metrics["outages"]]
     if metrics["terrain"]:
         ranked = sorted(metrics["terrain"].items(), key=lambda item: -item[1])
-        shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in ranked if share >= 0.005)
+        shares = ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in ranked if share >= 0.005)
         sentences.append(f"Detected terrain, by time: {shares}.")
     rejected = [f"{count} of {name}" for name, count in metrics["rejected"].items() if count]
     if rejected:

@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -30,6 +31,8 @@ EXACT_IN_FLOAT32 = 2.0e4
 """Numbers up to this size are sent in single precision: their steps are below 2 mm there."""
 TIME_LABEL_PX = 16
 """Of the label below a figure over time."""
+LETTER_PX = 8
+"""Height of a figure over time that a letter of its upright label takes: a longer one has two lines."""
 AXIS_PX = 80
 """Left of all figures, so that the same time stands at the same place in each."""
 NO_VALUE = "#80808040"
@@ -94,6 +97,7 @@ class Sheet:
             limits: of that axis; by default those of the data.
         """
         shown = {} if limits is None else {"y_range": tuple(map(float, limits))}
+        label = textwrap.fill(label, height // LETTER_PX)
         plot = self.add(
             f"over time {key}", "time, s", label, height + TIME_LABEL_PX, "xbox_zoom,xpan,xwheel_zoom,reset",
             x_range=self.time, y_axis_type="log" if log else "linear", active_drag="xbox_zoom", **shown,

@@ -52,7 +52,11 @@ TRUTH_ON_ANY, EXPECTED_ON_ANY, OUTAGE_ON_ANY = "#808080", "#808080", "#808080"
 BEFORE, AFTER = "#d55e00", "#0072b2"
 LINE_LUMINANCE = (0.13, 0.29)
 """Relative luminance (WCAG 2.1) of lines that stand out on a light and on a dark page."""
-SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
+SPARE_COLOURS = (
+    "#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc", "#117733", "#ddcc77",
+    "#cc6677", "#ee7733", "#225555",
+)  # fmt: skip
+"""One for each of the `memory.MOST_GROUNDS` that a robot finds."""
 
 MAX_POINTS = 1200
 """Longer lines are thinned to this many points before they are drawn."""

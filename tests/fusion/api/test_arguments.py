@@ -70,6 +70,7 @@ def test_a_policy_may_be_a_path_as_text(log: tf.Recording, tmp_path: Path) -> No
         ({"lag_s": float("nan")}, "'lag_s' is nan, out of range"),
         ({"lag_s": float("inf")}, "'lag_s' is inf, out of range"),
         ({"lag_s": "5"}, "'lag_s' is '5'; give"),
+        ({"lag_s": None}, "'lag_s' is 'None'; give a number"),
         ({"lag_s": 0.2}, "at least five keyframes"),
     ],
 )
@@ -100,6 +101,19 @@ def test_a_simulation_refuses_wrong_arguments(wrong: dict[str, Any], message: st
 def test_what_is_no_log_is_refused(wrong: Any) -> None:
     with pytest.raises(tf.DataError, match="is no log; give a Recording, or the path"):
         tf.replay(wrong)
+
+
+@pytest.mark.parametrize("out", [None, 3])
+def test_a_place_to_write_that_is_no_path_is_refused(out: Any) -> None:
+    for write in (
+        lambda: tf.sweep("friction_slope", out),
+        lambda: tf.benchmark(out, quick=True),
+        lambda: tf.policy.fit(out),
+        lambda: tf.Replay.report(None, out),
+        lambda: tf.Diagnosis.report(None, out),
+    ):
+        with pytest.raises(tf.ConfigError, match=f"'out' is {out}; give a path"):
+            write()
 
 
 def test_one_name_needs_no_list(log: tf.Recording, tmp_path: Path) -> None:

@@ -92,8 +92,9 @@ def test_help_loads_no_heavy_package() -> None:
     assert time.monotonic() - begun < 5.0, "0.2 s on an idle machine"
 
 
-def test_a_misspelt_log_is_told_before_heavy_packages_are_loaded() -> None:
-    assert heavy_packages_of("replay", "no.bag") == "numpy"
+@pytest.mark.parametrize("command", ["replay", "live"])
+def test_a_misspelt_log_is_reported_before_heavy_packages_are_loaded(command: str) -> None:
+    assert heavy_packages_of(command, "no.bag") == "numpy"
 
 
 def described(big: bool = False, place: str | None = None) -> Result:

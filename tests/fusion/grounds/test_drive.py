@@ -39,18 +39,25 @@ def test_a_drive_adds_to_the_memory_and_the_next_one_goes_on(drive: Recording, t
     assert first is not None
     assert len(first) == 1
     save_grounds(first, path)
-    second = tf.replay(drive, grounds=path).grounds
+    run = tf.simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=4)
+    second = tf.replay(until(run, 30.0), grounds=path).grounds
     assert second is not None
     assert len(second) == 1
     assert second.grounds[0].windows > 1.5 * first.grounds[0].windows
+    save_grounds(second, path)
+    again = tf.replay(drive, mode="fixed", outages=[(20.0, 5.0)], grounds=path)
+    assert again.grounds is not None
+    assert again.grounds.grounds[0].windows == pytest.approx(second.grounds[0].windows, rel=1e-4)
+    assert any("learned from this drive before" in note for note in again.estimate.notes)
 
 
 def test_the_terrain_of_a_drive_is_told_by_the_grounds_that_the_robot_found(drive: Recording) -> None:
     result = replay(drive)
-    shares = metrics_of(result)["terrain"]
+    metrics = metrics_of(result)
+    shares = metrics["terrain"]
     assert shares["ground 1"] > 0.7
     assert sum(shares.values()) == pytest.approx(1.0)
-    assert any(f"ground 1 {100 * shares['ground 1']:.0f} %" in s for s in summary_of_one(metrics_of(result)))
+    assert f"ground 1 ({100 * shares['ground 1']:.0f} %)" in " ".join(summary_of_one(metrics))
 
 
 def test_a_ground_by_its_label_has_the_slip_that_the_robot_shows_on_it(drive: Recording) -> None:

@@ -14,7 +14,7 @@ from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.file import load_grounds, save_grounds
 from terrafusion.fusion.grounds.ground import FRICTION_MODELS, Ground, Tally
 from terrafusion.fusion.grounds.learner import StretchMeter
-from terrafusion.fusion.grounds.memory import DWELL, MOST_GROUNDS, GroundMemory, merged
+from terrafusion.fusion.grounds.memory import DWELL, MOST_GROUNDS, GroundMemory, after_drive, merged
 from terrafusion.fusion.grounds.signature import SIGNATURE, VIBRATION, SignatureExtractor
 from terrafusion.fusion.terrain.features import Window
 
@@ -195,6 +195,25 @@ def test_a_memory_beside_the_one_it_began_counts_once(tmp_path: Path) -> None:
     for given in ([monday, tuesday], [tuesday, monday]):
         windows = [g.windows for g in merged(given).grounds]
         assert windows == sorted((g.windows for g in tuesday.grounds), reverse=True)
+
+
+def test_a_file_of_robots_without_a_vehicle_file_says_so(tmp_path: Path) -> None:
+    memory, path = two_grounds(), tmp_path / "grounds.yaml"
+    memory.robot = "my_robot"
+    assert save_grounds(memory, path) == f"2 grounds of 'my_robot' to {path}"
+    memory.robot = "generic"
+    assert "keep a file a robot, or give --vehicle" in save_grounds(memory, path)
+
+
+def test_drives_that_are_counted_stay_marked(tmp_path: Path) -> None:
+    one, path = two_grounds(1), tmp_path / "grounds.yaml"
+    one.drives = ("a", "b")
+    save_grounds(merged([one.named({"ground 1": "lawn"}), GroundMemory(drives=("b", "c"))]), path)
+    known = load_grounds(path).copy()
+    assert known.drives == ("a", "b", "c")
+    learned = two_grounds(2)
+    assert after_drive(known, learned, "b") is known
+    assert after_drive(known, learned, "d").drives == ("d",)
 
 
 def test_a_full_memory_counts_what_it_leaves_out() -> None:

@@ -72,6 +72,8 @@ def test_every_state_of_a_calibration_has_its_unit_and_prior(drive: Any) -> None
     assert told["imu_yaw_rad"][0].endswith(", deg")
     assert float(told["imu_yaw_rad"][1]) == pytest.approx(yaw_deg, abs=5e-4)
     assert told["imu_yaw_rad"][4] == "not observable on this drive"
+    of_no_unit = {"state": "slip_per_grade", "value": 0.4, "sigma": 0.1, "prior_sigma": 0.4, "observed": True}
+    assert cells(of_no_unit)[0] == "slip over the sine of the slope"
 
 
 @pytest.mark.parametrize("calibrated", [False, True])

@@ -46,6 +46,11 @@ def test_parameters_of_several_grounds_keep_the_name_of_their_ground() -> None:
     assert _short(names[:2]) == ["wheel.radius_m", "shear.friction_cap"]
 
 
+def test_a_label_that_is_longer_than_its_axis_has_two_lines() -> None:
+    figure = Sheet().add_time("a", "accelerometer bias, m/s²", 180).panel.figure
+    assert figure.yaxis[0].axis_label == "accelerometer bias,\nm/s²"
+
+
 def test_a_hollow_mark_is_hollow_in_the_legend() -> None:
     plot = Sheet().add_rows("rows a", "x", ["a"])
     one = np.zeros(1)

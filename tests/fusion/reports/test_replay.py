@@ -15,6 +15,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss, Terrain
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
+from terrafusion.fusion.grounds.memory import MOST_GROUNDS
 from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.scores import Outage, score
 from terrafusion.fusion.outputs.replay_files import metrics_of
@@ -290,7 +291,7 @@ def test_a_ground_that_nothing_tells_colours_nothing(drive):
 
 
 def test_grounds_and_outages_look_different(drive):
-    names = [*style.TERRAIN_COLOURS, *(f"ground {k}" for k in range(1, len(style.SPARE_COLOURS) + 1))]
+    names = [*style.TERRAIN_COLOURS, *(f"ground {k}" for k in range(1, MOST_GROUNDS + 1))]
     assert len({style.terrain_colour(name) for name in names}) == len(names)
     d = drive(seconds=60.0)
     sheet = Sheet(60.0, OUTAGES, d.recording.start_ns)
