@@ -105,7 +105,8 @@ class TerrainDetector:
             )
         self.credit.claim(q / q.sum())
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
-        self._filter.update(EXTERNAL_TRUST * share * self.credit.value * np.log(q))
+        if share > 0.0:
+            self._filter.update(EXTERNAL_TRUST * share * self.credit.value * np.log(q))
         return self.probabilities
 
 

@@ -14,6 +14,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State, WeightChange
 from terrafusion.fusion.grounds.learner import FrictionBank, GroundLearner
 from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.fusion.grounds.signature import STANDS
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.validation import as_numbers
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
@@ -30,6 +31,8 @@ UPDATE_NS = 500_000_000
 WINDOW_NS = 1_000_000_000
 BELIEVED = 0.5
 """Credit from which the label, and not the detector, is taken for the ground."""
+STANDING_NS = 2_000_000_000
+"""A robot that stands sees the same ground in all pictures: those of so long count as evidence (assumed)."""
 MOST_CHANGES = 1000
 """Records kept where nobody takes them: memory must not grow over days."""
 
@@ -95,6 +98,7 @@ class TerrainNoise:
         self._last_speed = np.nan
         self._source = "detector"
         self._external_ns: int | None = None
+        self._seen_standing_ns = 0
 
     def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
         """Take over the slip that the robot itself shows: mean and sigma for the ground that no class
@@ -212,8 +216,13 @@ class TerrainNoise:
                 remedy=f"the policy knows {', '.join(self.detector.classes)}",
             )
         given = [probabilities.get(name, 0.0) for name in self.detector.classes]
-        since_ns = UPDATE_NS if self._external_ns is None else abs(t_ns - self._external_ns)
-        self.detector.fuse(as_numbers(given, "probabilities", "terrain"), min(since_ns / UPDATE_NS, 1.0))
+        since_ns = UPDATE_NS if self._external_ns is None else min(abs(t_ns - self._external_ns), UPDATE_NS)
+        if self.window is None or self.window.ground_speed_mps() < STANDS:
+            since_ns = min(since_ns, STANDING_NS - self._seen_standing_ns)
+            self._seen_standing_ns += since_ns
+        else:
+            self._seen_standing_ns = 0
+        self.detector.fuse(as_numbers(given, "probabilities", "terrain"), since_ns / UPDATE_NS)
         self._external_ns = t_ns
         self._source = "external source"
         self._reweight(t_ns)
