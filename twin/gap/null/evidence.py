@@ -9,7 +9,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.start import Soils
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.logs import digest, prepared
+from terrafusion.twin.gap.data.logs import order_of, prepared
 from terrafusion.twin.gap.data.samples import driven_by
 from terrafusion.twin.gap.data.threads import in_threads
 from terrafusion.twin.gap.null.channel_noise import learn_noise
@@ -39,7 +39,7 @@ class GapEvidence:
         candidates: effects, as changes of that twin's.
         channels: observed channels.
         noise: of each channel.
-        runs, references: whitened residuals of each; references by their content, in whatever order given.
+        runs, references: whitened residuals of each; references in the order of `order_of`.
         reference_names: in the order given.
         soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
         cache: linearisations, shared by runs with equal commands.
@@ -81,7 +81,7 @@ def gather_evidence(
         DataError: a log lacks a channel that is needed.
         TerrafusionError: the twin diverges on every reference.
     """
-    names, references = tuple(r.name for r in references), sorted(references, key=digest)
+    names, references = tuple(r.name for r in references), sorted(references, key=order_of)
     logs, model, notes = prepared([*runs, *references], vehicle, soils, source)
     jobs, R = jobs if is_thread_safe(model, candidates) else 1, len(runs)
     channels = tuple(o.channel for o in logs[0].observed)
