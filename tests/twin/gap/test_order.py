@@ -48,6 +48,7 @@ def test_where_and_when_runs_were_made_does_not_matter() -> None:
         diagnose([*map(move, judged)], [*map(move, references)], load_vehicle("elevate"), effects=EFFECTS)
         for move in (lambda run: dataclasses.replace(run, truth=None), elsewhere)
     )
+    assert [r.name for r in second.evidence.references] == [r.name for r in first.evidence.references]
     assert first.verdict.named
     assert second.verdict.named == first.verdict.named
     assert second.detection.statistic == pytest.approx(first.detection.statistic, rel=1e-3)
