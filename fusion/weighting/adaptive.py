@@ -217,7 +217,7 @@ class TerrainNoise:
             )
         given = [probabilities.get(name, 0.0) for name in self.detector.classes]
         since_ns = UPDATE_NS if self._external_ns is None else min(abs(t_ns - self._external_ns), UPDATE_NS)
-        if self.window is None or self.window.ground_speed_mps() < STANDS:
+        if self.window is not None and self.window.ground_speed_mps() < STANDS:
             since_ns = min(since_ns, STANDING_NS - self._seen_standing_ns)
             self._seen_standing_ns += since_ns
         else:

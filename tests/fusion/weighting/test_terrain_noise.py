@@ -161,12 +161,12 @@ def test_a_fast_camera_counts_as_much_as_a_slow_one() -> None:
 
 def test_pictures_of_one_ground_count_once_while_the_robot_stands() -> None:
     """After a minute before one place, a camera that was half sure of mud had made it 0.999."""
-    weights = noise_of("elevate")
+    weights, empty = noise_of("elevate"), np.zeros((0, 3))
+    weights.window = Window(0.5, np.zeros(0), empty, empty, 0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(120):
         weights.external(k * 500_000_000, {"mud": 0.5, "asphalt": 0.4, "loose_sand": 0.1})
     assert weights.posterior()["mud"] == pytest.approx(0.5, abs=0.03)
-    empty = np.zeros((0, 3))
-    weights.window = Window(0.5, np.zeros(0), empty, empty, 1.0, 0.0, 1.0, 0.0, 0.0)
+    weights.window = dataclasses.replace(weights.window, speed_mps=1.0, wheel_speed_mps=1.0)
     for k in range(120, 180):
         weights.external(k * 500_000_000, {"mud": 0.5, "asphalt": 0.4, "loose_sand": 0.1})
     assert weights.posterior()["mud"] > 0.9
