@@ -59,7 +59,7 @@ def check_steering(context: CheckContext) -> Iterator[Finding]:
     """The angles must turn the robot as far as it turns; for their sign see `yaw_agreement`."""
     known = motion.yaw_angles(context)
     turned, steering = known.get("gyro") or known.get("truth"), context.recording.steering
-    if turned is None or steering is None or steering.names == ("steering_wheel",):
+    if turned is None or steering is None or not len(steering) or steering.names == ("steering_wheel",):
         return
     source = "gyro" if "gyro" in known else "truth"
     if not np.ptp(steering.angle_rad, axis=0).any():
@@ -75,13 +75,18 @@ def check_steering(context: CheckContext) -> Iterator[Finding]:
     metric = _wheelbase_m(context) is not None and context.wheel_radius_m() is not None
     if unit != 1.0:
         factor = unit if unit == DEGREE and (not metric or 1.0 / SAME < scale < SAME) else unit * scale
+        fix = "check their unit: rad, of the wheels"
+        if sure and factor == DEGREE:
+            fix = "multiply by pi / 180"
+        elif sure:
+            fix = f"multiply by {factor:.3g}, or call them `steering_wheel_rad` and state `steering_ratio`"
         yield Finding(
             "steering-unit", "error", "steering",
             f"the angles reach {largest:.3g} rad: no wheels turn so far",
-            f"times {factor:.3g} they turn the robot as the {source} does; correlation {both.r:.2f}",
-            "multiply by pi / 180"
-            if factor == DEGREE
-            else f"multiply by {factor:.3g}, or call them `steering_wheel_rad` and state `steering_ratio`",
+            f"times {factor:.3g} they turn the robot about as the {source} does; correlation {both.r:.2f}"
+            if sure
+            else f"in deg they do not turn the robot as the {source} does; correlation {both.r:.2f}",
+            fix,
             scaled("steering", factor, "angle_rad") if sure and metric else None,
         )  # fmt: skip
     elif sure and metric and not 1.0 / SAME < scale < SAME:

@@ -231,7 +231,7 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
             what = (
                 f"no fix in the last {early_s:.2f} s"
                 if name == "gnss"
-                else (f"ends {early_s:.2f} s before the other channels")
+                else f"ends {early_s:.2f} s before the other channels"
             )
             evidence = f"its last sample is at t = {context.since_start_s(channel.t_ns[-1]):.2f} s"
         else:

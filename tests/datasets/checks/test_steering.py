@@ -84,6 +84,20 @@ def test_angles_of_another_robot_are_named() -> None:
     assert codes(log) == {"steering-unrelated"}
 
 
+def test_large_angles_that_turn_nothing_are_not_repaired() -> None:
+    log = steered(lambda a: np.random.default_rng(1).normal(0.0, 30.0, a.shape))
+    (found,) = run_checks(log)
+    assert (found.code, found.repair) == ("steering-unit", None)
+    assert "check their unit" in found.fix
+
+
+def test_a_channel_without_rows_has_no_finding() -> None:
+    log = drive()
+    assert log.steering is not None
+    empty = log.steering.select(np.zeros(len(log.steering), dtype=bool))
+    assert codes(dataclasses.replace(log, steering=empty)) == set()
+
+
 def test_without_a_wheelbase_angles_have_no_scale() -> None:
     assert codes(dataclasses.replace(steered(lambda a: 0.5 * a), overrides=Overrides())) == set()
 
