@@ -1,11 +1,13 @@
 """Scales: wheel speed against the speed over ground (unit, radius, slip, wheels that roll while the robot
-stands), and the gyro about z against the yaw of the truth, else against the shape of the measured path.
+stands or stand while it moves), and the gyro about z against the yaw of the truth, else against the shape of
+the measured path.
 """
 
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed_field, scaled
 from terrafusion.datasets.checks.motion import common_span, runs, wheel_speed, yaw_angles
@@ -28,7 +30,7 @@ SOFT = ("medium_sand", "loose_sand", "ploughed_soil", "mud", "snow", "ice")
 """Grounds on which such slip is usual."""
 UNIT_ERROR = 0.1
 WIDEST_RADIUS = 0.2
-"""A radius makes one ratio: with an interval wider than this share of it, no radius is offered (assumed)."""
+"""A radius makes one ratio: with an interval, or a spread of stretches, beyond this none is offered."""
 FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
 LARGEST_WHEEL_M = 0.5
@@ -78,7 +80,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
             scaled("wheels", factor, "speed") if len(units) == 1 else None,
         )  # fmt: skip
     elif scale.ratio > MOST_SLIP_FREE * known and scale.low > SIGNIFICANT_RATIO * known:
-        yield _too_slow(context, scale, evidence, wheels.unit, radius)
+        yield _too_slow(context, scale, spread, evidence, wheels.unit, radius)
     elif (scale.ratio < SMALL * known or scale.high < FIRM_SLIP * known) and is_firm(context.recording):
         fitting = f"radius ({radius * scale.ratio:.4f} m fits)" if wheels.unit == "radps" else "speeds"
         fix = f"it may be slip; if the ground is firm, check wheel {fitting} and unit"
@@ -93,13 +95,18 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _too_slow(context: CheckContext, scale: PathScale, evidence: str, unit: str, radius: float) -> Finding:
+def _too_slow(
+    context: CheckContext, scale: PathScale, spread: float, evidence: str, unit: str, radius: float
+) -> Finding:
     downhill = _descent(context.recording) > STEEPEST
     fitting = radius * scale.ratio
     repair: Repair | None = None
-    uneven = scale.high - scale.low > WIDEST_RADIUS * scale.ratio
+    uneven = max(scale.high / scale.ratio - scale.low / scale.ratio, spread) > WIDEST_RADIUS
     if scale.ratio > LARGEST_RADIUS_ERROR or downhill or uneven:
-        fix = "check wheel radius and unit" + (", and that both are of one robot" if uneven else "")
+        fix = "check wheel radius and unit"
+        if uneven:
+            fix += ", that both are of one robot, and that it does not move sideways, as on mecanum wheels: "
+            fix += f"the ratio changes by {spread:.0%} between stretches"
         fix += ", or did it roll downhill on braked wheels?" if downhill else ""
     elif unit == "mps":
         repair = scaled("wheels", scale.ratio, "speed")
@@ -232,12 +239,15 @@ FROZEN_M = 1e-4
 
 
 def check_standing(context: CheckContext) -> Iterator[Finding]:
-    """The robot must move when its wheels roll; on soft ground they may spin."""
+    """The robot must move when its wheels roll, on soft ground they may spin, and stand when they stand."""
     reckoned = dead_reckoned(context)
-    if reckoned is None or not is_firm(context.recording):
+    if reckoned is None:
         return
     t, rolled, path = reckoned
-    pace = float(rolled[-1]) / max(float(t[-1] - t[0]), 1e-3)
+    pace = float(np.sum(np.diff(rolled) ** 2 / np.diff(t).clip(1e-3))) / max(
+        float(rolled[-1]), 1e-3
+    )  # moving
+    named: set[str] = set()
     for measured in measured_paths(context.recording):
         least_m = max(LEAST_EXTENT_M, FURTHER * SIGMAS * measured.sigma_m)
         window_s = float(np.clip(1.5 * least_m / max(pace, 1e-3), *WINDOW_S))
@@ -248,20 +258,55 @@ def check_standing(context: CheckContext) -> Iterator[Finding]:
         far, spread = (_extents(measured.t_s, place, grid) for place in (rolled_to, measured.place))
         still = spread < np.maximum(STANDING * far, SIGMAS * measured.sigma_m)
         standing = (far > least_m) & still & (spread > FROZEN_M)  # frozen fixes are another finding
-        if not standing.any():
-            continue
-        begins, ends = runs(standing)
-        longest = int(np.argmax(ends - begins))
-        begin, end = int(begins[longest]), int(ends[longest])
-        yield Finding(
-            "standing", "warning", "wheels",
-            "the wheels roll while the robot stands",
-            f"by the {measured.source} it keeps within {spread[begin:end].max():.2f} m in each "
-            f"{window_s:.0f} s from t = {grid[begin]:.0f} to {grid[end]:.0f} s; wheels and gyro move "
-            f"by {far[begin:end].min():.1f} m and more",
-            "leave these stretches out, or say that the ground is soft: nothing else tells how it slipped",
-        )  # fmt: skip
-        return
+        moves = _keeps_moving(measured.t_s, measured.place, grid, spread) & (spread > least_m)
+        carried = _longest((far < STANDING * spread) & moves)
+        if carried and carried.stop - carried.start > 1 and "carried" not in named:
+            named.add("carried")
+            yield _carried(measured.source, window_s, grid, carried, far, spread)
+        longest = _longest(standing)
+        if longest and "standing" not in named and is_firm(context.recording):
+            named.add("standing")
+            yield Finding(
+                "standing", "warning", "wheels",
+                "the wheels roll while the robot stands",
+                f"by the {measured.source} it keeps within {spread[longest].max():.2f} m "
+                f"{_in_each(window_s, grid, longest)}; wheels and gyro move by {far[longest].min():.1f} m "
+                "and more",
+                "leave these stretches out, or say that the ground is soft: nothing else tells how it "
+                "slipped",
+            )  # fmt: skip
+
+
+def _carried(source: str, window_s: float, grid: Array, windows: slice, far: Array, spread: Array) -> Finding:
+    return Finding(
+        "carried", "warning", "wheels",
+        "the wheels stand while the robot moves",
+        f"by the {source} it moves by {spread[windows].min():.1f} m and more "
+        f"{_in_each(window_s, grid, windows)}; wheels and gyro move by {far[windows].max():.1f} m at most",
+        "leave these stretches out if it was pushed, towed or carried; else check the encoders there",
+    )  # fmt: skip
+
+
+def _in_each(window_s: float, grid: Array, windows: slice) -> str:
+    return f"in each {window_s:.0f} s from t = {grid[windows.start]:.0f} to {grid[windows.stop]:.0f} s"
+
+
+def _longest(found: NDArray[np.bool_]) -> slice | None:
+    """The longest run of windows; None where there is none."""
+    if not found.any():
+        return None
+    begins, ends = runs(found)
+    longest = int(np.argmax(ends - begins))
+    return slice(int(begins[longest]), int(ends[longest]))
+
+
+def _keeps_moving(t_s: Array, place: Complex, grid: Array, extents: Array) -> NDArray[np.bool_]:
+    """Whether positions (N,) move on in all quarters of each window: jumps, as by reflections, do not."""
+    edges = np.searchsorted(t_s, np.interp(np.arange(4 * len(grid) - 3) / 4.0, np.arange(len(grid)), grid))
+    total = np.concatenate([[0.0], np.cumsum(place - place[0])])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (np.diff(total[edges]) / np.diff(edges)).reshape(-1, 4)
+    return np.asarray((np.abs(np.diff(mean, axis=1)) > 0.1 * extents[:, None]).all(axis=1))
 
 
 def _extents(t_s: Array, place: Complex, grid: Array) -> Array:

@@ -14,6 +14,7 @@ import pytest
 
 import terrafusion as tf
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.checks.scale import _keeps_moving
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -278,6 +279,35 @@ def test_wheels_that_roll_under_a_standing_robot_are_named() -> None:
     imu = dataclasses.replace(log.imu, gyro_radps=rng.normal(0.0, 0.002, log.imu.gyro_radps.shape))
     standing = dataclasses.replace(log, gnss=gnss, imu=imu, truth=None, truth_channels=(), command=None)
     assert "standing" in {finding.code for finding in run_checks(standing, rig(log))}
+
+
+def test_wheels_that_stand_while_the_robot_is_pushed_are_named() -> None:
+    log = LOGS["simulated"]()
+    assert log.wheels is not None
+    since_s = (log.wheels.t_ns - log.start_ns) * 1e-9
+    speed = np.where((since_s > 50.0)[:, None], 0.0, log.wheels.speed)
+    pushed = dataclasses.replace(log.wheels, speed=speed, angle_rad=None)
+    found = run_checks(dataclasses.replace(log, wheels=pushed, command=None), rig(log))
+    assert "carried" in {finding.code for finding in found}
+
+
+def test_reflected_fixes_of_a_standing_robot_do_not_carry_it() -> None:
+    rng, t_s, grid = np.random.default_rng(0), np.arange(0.0, 400.0, 0.5), np.arange(0.0, 400.0, 20.0)
+    noise = rng.normal(0.0, 0.5, (len(t_s), 2)) @ np.array([1.0, 1j])
+    moves = 1.0 * t_s + noise
+    jumps = np.where((t_s > 105.0) & (t_s < 131.0), 9.0, 0.0) + np.where(t_s > 309.0, 12.0, 0.0) + noise
+    assert _keeps_moving(t_s, moves, grid, np.full(len(grid) - 1, 20.0)).all()
+    assert not _keeps_moving(t_s, jumps, grid, np.full(len(grid) - 1, 9.0)).any()
+
+
+def test_fixes_half_a_minute_late_do_not_show_a_standing_robot() -> None:
+    """The clock is named; that the robot stands while its wheels roll follows from it."""
+    log = LOGS["simulated"]()
+    assert log.gnss is not None
+    late = dataclasses.replace(log.gnss, t_ns=log.gnss.t_ns + 18 * 10**9)
+    codes = {finding.code for finding in run_checks(dataclasses.replace(log, gnss=late), rig(log))}
+    assert "clock-offset" in codes
+    assert not codes & {"standing", "carried"}
 
 
 def test_fixes_that_end_within_a_window_show_no_standing_robot() -> None:

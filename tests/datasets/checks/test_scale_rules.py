@@ -31,7 +31,7 @@ def judged(
     ratio: float,
     half: float = 0.001,
     *,
-    spread: float = 0.5,
+    spread: float = 0.15,
     source: str = "gnss",
     wheel_scale: float = 0.0,
     weight: np.ndarray | None = None,
@@ -133,6 +133,16 @@ def test_a_larger_wheel_is_repaired_by_its_radius_or_the_speeds(
     repaired = finding.repair(metres).wheels
     assert repaired is not None
     assert repaired.speed == pytest.approx(1.1 * drive.wheels.speed * RADIUS_M)
+
+
+def test_a_ratio_that_changes_between_stretches_is_no_radius(
+    drive: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On mecanum wheels that drive aslant, the ground was 1.67 times the wheels: a radius was put in."""
+    (finding,) = judged(drive, monkeypatch, 1.67, spread=0.37)
+    assert (finding.code, finding.repair) == ("wheel-radius", None)
+    assert "changes by 30% between stretches" in finding.fix
+    assert "mecanum" in finding.fix
 
 
 @pytest.mark.parametrize(
