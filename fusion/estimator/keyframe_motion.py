@@ -108,7 +108,7 @@ class MotionInput:
             travelled, segments, float(bias_z), rig.track_m, rig.quantum_m, noise, change_mps, calibrate,
             self._learned.course_lag_s(),
         )  # fmt: skip
-        increment = self._jitter.applied(increment)
+        increment = self._jitter.applied(increment, self._wheels.count_m())
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
             known = None if in_gap else chain.covariance

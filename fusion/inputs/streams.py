@@ -52,8 +52,7 @@ def mean_yaw_rate_radps(segments: list[ImuSegment]) -> float:
 
 
 SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
-"""Beyond these, on any axis, a sample is a spike (assumed): a shock lasts for less than a sample, and taken
-for all of it, at 100 Hz, it is half a metre a second."""
+"""Beyond these, on any axis, a sample is a spike (assumed): held for 10 ms a shock would be 0.5 m/s."""
 SPIKE_WINDOW_NS = 500_000_000
 """Where half the samples of this time are spikes, they are believed."""
 REPLACED_BY = 10
@@ -63,8 +62,7 @@ LONGEST_PAUSE_NS = 20_000_000_000
 BEFORE_PAUSE_NS = 5_000_000_000
 """For so long the samples of a silent IMU may still come; then the wheels go on without it."""
 USUAL_GAP_S = 0.5
-"""Time between samples up to which a stream of any rate has no gap (assumed: lost messages of a 10 Hz
-sensor)."""
+"""Up to this time between samples no stream has a gap (assumed: lost messages of a 10 Hz sensor)."""
 GAP_INTERVALS, SLOWEST_INTERVAL_S = 2.5, 2.0
 """A slow stream has a gap where samples are missing by its own interval, of at most 2 s."""
 INTERVALS_SEEN = 21
@@ -409,6 +407,12 @@ class WheelStream(SampleStream):
         left = self.left_m[j - 1] + w * (self.left_m[j] - self.left_m[j - 1])
         right = self.right_m[j - 1] + w * (self.right_m[j] - self.right_m[j - 1])
         return left, right
+
+    def count_m(self) -> float:
+        """Travel of the smallest step between the last speeds of the left side over one interval, m."""
+        speeds = sorted({round(left, 6) for left, _ in self._speeds[-INTERVALS_SEEN:]})
+        steps = [b - a for a, b in itertools.pairwise(speeds)]
+        return min(steps, default=0.0) * usual_interval_s(self.t_ns)
 
     def speed_change_mps(self, start_ns: int, end_ns: int) -> float:
         """Speed of both sides at the end less that at the start, m/s; 0 where samples are missing.

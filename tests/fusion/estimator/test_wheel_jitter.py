@@ -30,6 +30,20 @@ def test_noise_of_the_counter_is_found(position_sigma_m: float) -> None:
     assert np.median(shown[200:]) == pytest.approx(np.sqrt(2.0) * position_sigma_m, rel=0.2)
 
 
+@pytest.mark.parametrize("pace", [0.3, 1.15, 2.6])
+def test_pulses_of_a_coarse_encoder_are_found(pace: float) -> None:
+    """Speeds of a whole number of counts, taken by the trapezoid rule: each count is in two increments."""
+    count_m, jitter = 0.08, WheelJitter()
+    rng = np.random.default_rng(0)
+    travel = pace * count_m * np.cumsum(1.0 + 0.02 * rng.normal(size=2000))
+    counted = np.diff(np.floor(travel / count_m)) * count_m
+    moved, true = 0.5 * (counted[1:] + counted[:-1]), np.diff(travel)[1:]
+    shown = [jitter.applied(increment(float(d)), count_m).sigma[0] for d in moved]
+    assert 0.9 * np.std(moved - true) < np.median(shown[200:]) < 2.0 * np.std(moved - true)
+    fine = WheelJitter()
+    assert np.median([fine.applied(increment(float(d))).sigma[0] for d in moved]) < np.median(shown)
+
+
 def test_quiet_wheels_keep_their_sigma() -> None:
     jitter = WheelJitter()
     speeds = 1.0 + 0.5 * np.sin(0.05 * np.arange(300))
