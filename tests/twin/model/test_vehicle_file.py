@@ -11,8 +11,10 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.sensors import assumed_sigma
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
 from terrafusion.twin.model.vehicle_file import read_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
 
 SHORT = """\
@@ -190,3 +192,27 @@ def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path:
     assert own.body.mass_kg == 80.0
     with pytest.raises(ConfigError, match="not a rotation"):
         load_vehicle(written(tmp_path / "bad.yaml", "robot: {imu_axes: ['+x', '+y', '-z']}\n"))
+
+
+def test_the_twin_has_the_errors_that_are_known_of_a_robots_sensors(tmp_path: Path) -> None:
+    text = (
+        "robot:\n  extends: elevate\n  gnss_delay_s: {value: -0.3, known: calibrated, sigma: 0.01}\n"
+        "  gyro_scale: {value: 0.25, known: calibrated, sigma: 0.01}\n"
+        "  gyro_bias_radps: {value: 0.01, known: %s, sigma: 0.01}\n"
+        "  wheel_scale: {value: 0.02, known: calibrated, sigma: 0.01}\n"
+    )
+    file = written(tmp_path / "own.yaml", text % "calibrated")
+    short = Scenario("short", 10.0, drive=(DriveSegment(10.0, v_mps=1.0, yaw_rate_radps=0.2),))
+    run, exact = (simulate(short, vehicle=vehicle, seed=2) for vehicle in (file, "elevate"))
+    assert run.gnss.t_ns - exact.gnss.t_ns == pytest.approx(-0.3e9)
+    read, true = (float(log.imu.gyro_radps[:, 2].mean()) for log in (run, exact))
+    assert read == pytest.approx(0.8 * true + 0.01, abs=5e-4)  # the bias drawn is not scaled
+    assert any("do not have wheel_scale of the vehicle's file" in note for note in run.notes)
+    assumed = load_vehicle(written(tmp_path / "own.yaml", text % "assumed"))
+    assert assumed.effects.keys() == {"gyro_scale/scale"}
+    # An effect that the file has itself stays, as `gap` writes it.
+    raw = dict(read_vehicle(file)[0])
+    raw["effects"] = {"gyro_scale": {"value": 0.1, "source": "as a gap analysis finds"}}
+    raw["robot"] = {**raw["robot"], "gyro_bias_radps": {"value": 0.02, "known": "measured", "sigma": 0.1}}
+    again = load_vehicle(dump_yaml(tmp_path / "again.yaml", raw))
+    assert again.effects == pytest.approx({"gyro_scale/scale": 0.1, "gyro_bias/constant": 0.025})
