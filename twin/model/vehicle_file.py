@@ -29,6 +29,7 @@ PLACES = {
 INERTIA, SIZE = ("body", "yaw_inertia_kgm2"), ("mass_kg", "wheel_radius_m", "track_m")
 Powers = Mapping[tuple[str, ...], tuple[int, int, int]]
 RESIZED: Powers = {
+    ("body", "payload_max_kg"): (1, 0, 0),
     INERTIA: (1, 0, 2),
     ("body", "wheelbase_m"): (0, 0, 1),
     ("body", "cg_height_m"): (0, 1, 0),
@@ -37,11 +38,11 @@ RESIZED: Powers = {
     ("drive", "no_load_speed_radps"): (0, -1, 0),
     ("drive", "stall_torque_nm"): (1, 1, 0),
     ("drive", "torque_limit_nm"): (1, 1, 0),
-    ("drive", "speed_loop_p_nms"): (1, 1, 0),
-    ("drive", "speed_loop_i_nm"): (1, 1, 0),
+    ("drive", "speed_loop_p_nms"): (1, 2, 0),
+    ("drive", "speed_loop_i_nm"): (1, 2, 0),
 }
 """Numbers of the generic vehicle, and the powers of the numbers `SIZE` with which they grow: a robot of its
-shape, as fast, and as strong for its weight."""
+shape, as fast, as strong for its weight, and as quick to follow its commands."""
 BY_SENSORS = "as known of the robot's sensors"
 """Source of errors of the twin's sensors that a file's section `robot` makes."""
 MEASURED = ("measured", "field log")

@@ -173,6 +173,9 @@ def test_what_a_short_file_leaves_out_is_in_proportion_to_the_robot(tmp_path: Pa
     assert large.drive.torque_limit_nm == pytest.approx(6.0 * generic.drive.torque_limit_nm)
     assert large.wheel.inertia_kgm2 == pytest.approx(12.0 * generic.wheel.inertia_kgm2)
     assert large.drive.gear_ratio == generic.drive.gear_ratio
+    # As quick to follow commands: the loop's gain over the inertia it moves, m R^2, is the same.
+    assert large.drive.speed_loop_p_nms == pytest.approx(12.0 * generic.drive.speed_loop_p_nms)
+    assert large.drive.speed_loop_i_nm == pytest.approx(12.0 * generic.drive.speed_loop_i_nm)
     top_mps = [v.drive.no_load_speed_radps * v.wheel.radius_m for v in (large, generic)]
     assert top_mps[0] == pytest.approx(top_mps[1])
     loaded = load_vehicle(
@@ -180,6 +183,15 @@ def test_what_a_short_file_leaves_out_is_in_proportion_to_the_robot(tmp_path: Pa
     )
     assert loaded.drive == husky.drive  # a known robot keeps its own motors
     assert loaded.body.yaw_inertia_kgm2 == pytest.approx(2.4 * husky.body.yaw_inertia_kgm2)
+
+
+@pytest.mark.parametrize("mass_kg", [0.1, 50_000.0])
+@pytest.mark.parametrize(("radius_m", "track_m"), [(0.02, 0.05), (2.0, 0.05), (0.02, 5.0), (2.0, 5.0)])
+def test_a_short_file_of_any_size_makes_a_whole_one(mass_kg, radius_m, track_m, tmp_path: Path) -> None:
+    numbers = {"mass_kg": mass_kg, "wheel_radius_m": radius_m, "track_m": track_m}
+    given = {name: {"value": value, "known": "assumed"} for name, value in numbers.items()}
+    own = load_vehicle(dump_yaml(tmp_path / "own.yaml", {"robot": given}))
+    assert (own.body.mass_kg, own.body.payload_max_kg) == (mass_kg, pytest.approx(mass_kg))
 
 
 def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path: Path) -> None:
