@@ -30,6 +30,15 @@ DATUM = (52.0, 8.0, 100.0)
 """ENU origin of simulated drives: latitude deg, longitude deg, height m."""
 _TERRAIN_HZ = 10.0
 _COMMAND_HZ = 50.0
+_NOT_SIMULATED = (
+    "yaw_factor",
+    "wheel_scale",
+    "wheel_delay_s",
+    "imu_roll_rad",
+    "imu_pitch_rad",
+    "imu_yaw_rad",
+)
+"""Numbers of a robot's sensors that the twin's do not have (those of delay and gyro they have)."""
 _TIPPING_ROWS = 10
 """Whether the robot tips over is checked in every so many samples."""
 
@@ -100,8 +109,8 @@ def _description(setup: RunSetup, noise: NoiseStreams) -> str:
 
 
 def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | VehicleParams) -> list[str]:
-    """Sensors slower than declared, when the robot would tip over, commands that its drive cannot follow, and
-    how many numbers are assumed.
+    """Sensors slower than declared, when the robot would tip over, known errors of sensors that are left out,
+    commands that its drive cannot follow, and how many numbers are assumed.
     """
     sensors = setup.vehicle.sensors
     imu_hz = sensors.imu.rate_hz
@@ -117,6 +126,12 @@ def run_notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | Vehicle
         notes.append(
             f"from {motion.t_s[tipped[0]]:.1f} s on the robot would tip over: a wheel carries no load, "
             "and the model keeps it down"
+        )
+    robot = vars(setup.vehicle.robot)
+    if left := [name for name in _NOT_SIMULATED if (n := robot[name]) and n.known != "assumed" and n.value]:
+        notes.append(
+            f"the twin's sensors do not have {', '.join(left)} of the vehicle's file, "
+            "for which a replay of this log corrects all the same"
         )
     if setup.vehicle.steered() is not None and setup.scenario.drive:
         sent = setup.scenario.commanded(motion.t_s)

@@ -1,5 +1,6 @@
 """A simulated run before its sensors: vehicle, ground and commands, checked and ready to be driven."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -96,6 +97,7 @@ def set_up(
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     scenario = scenario.with_ground(terrain, slope_deg, cross_slope_deg)
     scenario = scenario.with_payload(payload_kg, payload_at_m)
+    _check_numbers(scenario)
     _check_options(scenario, vehicle, seed)
     vehicle = with_payload(vehicle, scenario.payload_kg, scenario.payload_at_m)
     route = Route.of(scenario, soils)
@@ -108,6 +110,22 @@ def set_up(
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
     return RunSetup(scenario, vehicle, route, plant, np.arange(count) / rate, known)
+
+
+def _check_numbers(scenario: Scenario) -> None:
+    """Numbers of a scenario that is made in Python: those of files are checked on loading."""
+    segments = [dataclasses.asdict(segment) for segment in scenario.drive]
+    given = {f"drive[{i}].{key}": value for i, one in enumerate(segments) for key, value in one.items()}
+    points = enumerate(scenario.waypoints)
+    given |= {f"waypoints[{i}][{k}]": value for i, point in points for k, value in enumerate(point)}
+    given |= {"heading_deg": scenario.heading_deg, "duration_s": scenario.duration_s}
+    for key, value in given.items():
+        if not math.isfinite(value):
+            raise ConfigError(f"'{key}' is {value}", file=scenario.name, remedy="give a finite number")
+        if value <= 0.0 and key.endswith(("duration_s", ".period_s")):
+            raise ConfigError(f"'{key}' is {value:g}", file=scenario.name, remedy="give a number above zero")
+    if not scenario.route:
+        raise ConfigError("'route' is empty", file=scenario.name, remedy="name at least one terrain")
 
 
 def _check_options(scenario: Scenario, vehicle: VehicleParams, seed: int) -> None:

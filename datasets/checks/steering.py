@@ -34,7 +34,7 @@ def _turned(context: CheckContext, unit: float) -> motion.Integral | None:
     steering, driven = context.recording.steering, motion.wheel_speed(context)
     if steering is None or driven is None:
         return None
-    angles = unit * _axles(context)
+    angles = unit * axles(context)
     angles[np.abs(angles) > LARGEST_RAD] = np.nan
     front, rear = np.tan(angles).T
     t_s = motion.seconds(steering.t_ns, context.recording.start_ns)
@@ -42,8 +42,8 @@ def _turned(context: CheckContext, unit: float) -> motion.Integral | None:
     return motion.integral(context.recording.start_ns, steering.t_ns, rate)
 
 
-def _axles(context: CheckContext) -> Array:
-    """Mean angle (N, 2) of front and rear wheels."""
+def axles(context: CheckContext) -> Array:
+    """Mean angle (N, 2) of front and rear wheels, rad."""
     steering, rig = context.recording.steering, context.rig
     if steering is None:
         return np.zeros((0, 2))

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.checks import motion
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, changed
@@ -20,6 +21,7 @@ from terrafusion.datasets.checks.imu import (
 )
 from terrafusion.datasets.checks.path import measured_paths, scales
 from terrafusion.datasets.checks.scale import is_firm
+from terrafusion.datasets.checks.steering import axles
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import BootstrapInterval, interval_of, resampled_rows
 from terrafusion.datasets.core.channels import Imu, Wheels
@@ -29,6 +31,8 @@ from terrafusion.datasets.core.wrapped_angles import paired_sides, sampled_apart
 
 DEAD, LEAST_R, ODD_SCALE = 0.02, 0.9, 0.15
 """Speed of a wheel over its partner's below which it is dead; correlation and scale error of an odd one."""
+STRAIGHT_RAD = 0.3
+"""A wheel that is turned so far rolls 5 % further than the other one of its side; it does in every curve."""
 WIDEST_TRACK_M = 6.0
 """Sides at speeds -v and v spin a robot at v over half its effective track, which is below this."""
 LEAST_S, LEAST_MPS = 10.0, 0.05
@@ -50,7 +54,7 @@ def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
     wheels = context.recording.wheels
     if wheels is None or len(wheels.names) != 4:
         return
-    speed = wheels.speed[np.isfinite(wheels.speed).all(axis=1)]
+    speed = wheels.speed[np.isfinite(wheels.speed).all(axis=1) & _straight(context, wheels)]
     if len(speed) < 50 or not speed.any():
         return
     power = np.sqrt((speed**2).mean(axis=0))
@@ -66,6 +70,15 @@ def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
             f"multiply its speed by {factor:.3g}" if factor else "use the other wheel of the side for it",
             changed("wheels", _one_wheel, wheel=wheel, partner=partner, factor=factor),
         )  # fmt: skip
+
+
+def _straight(context: CheckContext, wheels: Wheels) -> NDArray[np.bool_]:
+    """Rows (N,) in which no wheel is turned by more than `STRAIGHT_RAD`."""
+    steering = context.recording.steering
+    if steering is None or not len(steering):
+        return np.ones(len(wheels), dtype=bool)
+    most = np.abs(axles(context)).max(axis=1)
+    return np.asarray(np.interp(wheels.t_ns, steering.t_ns, most) < STRAIGHT_RAD)
 
 
 def _odd_one(speed: Array, power: Array, front: int, rear: int) -> tuple[int, int, float | None, str] | None:

@@ -177,7 +177,7 @@ class Robot(SensorNumbers):
     wheel_radius_m: Annotated[KnownNumber, Known(Quantity("m", 0.02, 2.0))] | None = None
     track_m: Annotated[KnownNumber, Known(Quantity("m", 0.05, 5.0))] | None = None
     wheelbase_m: Annotated[KnownNumber, Known(Quantity("m", 0.05, 5.0))] | None = None
-    mass_kg: Annotated[KnownNumber, Known(Quantity("kg", 1.0, 5000.0))] | None = None
+    mass_kg: Annotated[KnownNumber, Known(Quantity("kg", 0.1, 50000.0))] | None = None
     imu_m: Place | None = None
     gnss_sigma_m: Annotated[KnownNumber, Known(Quantity("m", 1e-3, 100.0))] | None = None
     imu_axes: tuple[str, ...] | None = None

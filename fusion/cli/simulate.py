@@ -105,7 +105,7 @@ def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
 def summary_lines(run: SimulatedRun) -> list[str]:
     """The run in a few lines of text."""
     summary = run.summary
-    slip = _where_defined(100 * summary.mean_abs_slip, ".1f", " %", "undefined (never above 0.1 m/s)")
+    slip = _where_defined(100 * summary.mean_abs_slip, ".1f", " %", "undefined (it hardly moved)")
     energy = _where_defined(summary.energy_per_m_j, ".0f", " J/m", "a metre undefined (less than 0.1 m)")
     return [
         run.recording.description,

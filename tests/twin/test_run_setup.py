@@ -276,3 +276,20 @@ def test_a_class_of_fix_the_receiver_does_not_reach_is_reported(fix) -> None:
         ConfigError, match=r"'gnss_fix' is .*, not a class .* 'husky' .*; give single to single"
     ):
         simulate(asked, vehicle="husky")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"duration_s": math.nan}, "'duration_s' is nan; give a finite number"),
+        ({"duration_s": -1.0}, "'duration_s' is -1; give a number above zero"),
+        ({"waypoints": ((math.nan, 1.0),)}, r"'waypoints\[0\]\[0\]' is nan"),
+        ({"drive": (DriveSegment(9.0, v_mps=math.inf),)}, r"'drive\[0\].v_mps' is inf"),
+        ({"drive": (DriveSegment(9.0, v_amplitude_mps=1.0, period_s=0.0),)}, r"'drive\[0\].period_s' is 0"),
+        ({"route": ()}, "'route' is empty"),
+    ],
+)
+def test_a_wrong_scenario_made_in_python_is_reported(changes, message) -> None:
+    good = Scenario("made", 9.0, drive=(DriveSegment(9.0, v_mps=1.0),))
+    with pytest.raises(ConfigError, match=message):
+        simulate(dataclasses.replace(good, **changes))

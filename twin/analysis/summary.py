@@ -17,6 +17,8 @@ from terrafusion.twin.scenario.commands import DrivenStates, wheel_angles
 MOVING_MPS = 0.1
 """Slip is averaged over samples that move faster than this."""
 STOPPED_MPS = 0.05
+SLOW_SHARE = 0.5
+"""A robot moves at this share of the fastest speed commanded, where that is less than the two above."""
 LOST_TRAVEL_M = 5.0
 """A robot that stands while this much more travel is commanded is immobilised."""
 SPINNING_SHARE = 0.2
@@ -29,9 +31,9 @@ class RunSummary:
     """What a run amounts to.
 
     `mean_abs_slip` is the mean of |1 - v_odom / v_truth| over samples with
-    |v_truth| > 0.1 m/s (the source study's proxy, eq. 2), `mean_slip_ratio`
-    that of the wheels' mean of the usual (w R - u) / max(|w R|, |u|), without its sign; both NaN for a run
-    that never moves. `energy_j` is drawn from the battery, `motor_work_j` done at the
+    |v_truth| > 0.1 m/s, or half the fastest speed commanded (the source study's proxy, eq. 2),
+    `mean_slip_ratio` that of the wheels' mean of the usual (w R - u) / max(|w R|, |u|), without its sign;
+    both NaN for a run that never moves. `energy_j` is drawn from the battery, `motor_work_j` done at the
     wheels; their difference is `heat_j`, in battery, motors, gearboxes and braking.
     `slip_work_j` is spent in the slip of the wheels, `resistance_work_j`
     in rolling, compaction and drag; what is left of the motors' work is in height and speed.
@@ -83,7 +85,7 @@ def summarise(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams, 
     if vehicle.drive.type in STEERED_DRIVES:  # the part of a wheel's way that is ahead
         turned = turned * np.cos(wheel_angles(driven.inputs, vehicle))
     odometry = turned.mean(axis=1) * vehicle.odometry.wheel_radius_m
-    moving = np.abs(speed) > MOVING_MPS
+    moving = np.abs(speed) > _least_speed(MOVING_MPS, driven)
     distance = float(np.sum(np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1)))
     drawn, work, slipped, resisted = (
         states[:, INDEX[name]] for name in ("electric_energy", "motor_work", "slip_work", "resistance_work")
@@ -112,11 +114,18 @@ def summarise(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams, 
     )
 
 
+def _least_speed(usual_mps: float, driven: DrivenStates) -> float:
+    """From what speed a robot moves; turns on the spot alone command none."""
+    fastest = float(np.abs(driven.commanded[:, 0]).max())
+    return min(usual_mps, SLOW_SHARE * fastest) if fastest > 0.0 else usual_mps
+
+
 def _immobilised(
     t_s: Array, motion: BodyMotion, driven: DrivenStates, vehicle: VehicleParams
 ) -> tuple[float, float, float, str] | tuple[None, None, None, None]:
     """When, where (x, y) and why the robot came to rest for good, or nothing."""
-    moving = np.hypot(motion.velocity_body_mps[:, 0], motion.velocity_body_mps[:, 1]) > STOPPED_MPS
+    speed = np.hypot(motion.velocity_body_mps[:, 0], motion.velocity_body_mps[:, 1])
+    moving = speed > _least_speed(STOPPED_MPS, driven)
     commanded = driven.commanded[:, 0] != 0.0
     # A robot that never moved is stuck from its first command on.
     last = int(np.flatnonzero(moving)[-1]) if moving.any() else int(np.argmax(commanded))

@@ -115,7 +115,7 @@ class SensorRealism:
     gnss_white_share: Annotated[float, Sourced("", 0.0, 1.0)]
     gnss_single_sigma_m: Annotated[float, Sourced("m", 0.01, 100.0)]
     gnss_single_correlation_s: Annotated[float, Sourced("s", 0.0, 3600.0)]
-    gnss_latency_s: Annotated[float, Sourced("s", 0.0, 10.0)]
+    gnss_latency_s: Annotated[float, Sourced("s", -5.0, 10.0)]
     current_noise_a: Annotated[float, Sourced("A", 0.0, 100.0)]
     imu: ImuRealism = field(default_factory=ImuRealism)
     encoder: EncoderRealism = field(default_factory=EncoderRealism)

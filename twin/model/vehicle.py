@@ -32,9 +32,9 @@ GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m", "whee
 class Body:
     """Rigid body on four wheels; the centre of gravity is given from the body origin."""
 
-    mass_kg: Annotated[float, Sourced("kg", 1.0, 5000.0)]
-    payload_max_kg: Annotated[float, Sourced("kg", 0.0, 5000.0)]
-    yaw_inertia_kgm2: Annotated[float, Sourced("kg m2", 0.0005, 50000.0)]
+    mass_kg: Annotated[float, Sourced("kg", 0.1, 50000.0)]
+    payload_max_kg: Annotated[float, Sourced("kg", 0.0, 50000.0)]
+    yaw_inertia_kgm2: Annotated[float, Sourced("kg m2", 1e-5, 1e6)]
     wheelbase_m: Annotated[float, Sourced("m", 0.03, 5.0)]
     track_m: Annotated[float, Sourced("m", 0.05, 5.0)]
     cg_forward_m: Annotated[float, Sourced("m", -1.0, 1.0)]
@@ -51,7 +51,7 @@ class Wheel:
 
     radius_m: Annotated[float, Sourced("m", 0.02, 2.0)]
     width_m: Annotated[float, Sourced("m", 0.005, 2.0)]
-    inertia_kgm2: Annotated[float, Sourced("kg m2", 1e-5, 5000.0)]
+    inertia_kgm2: Annotated[float, Sourced("kg m2", 1e-7, 1e5)]
     grouser_height_m: Annotated[float, Sourced("m", 0.0, 0.3)] = 0.0
     grouser_count: Annotated[float, Sourced("", 0.0, 200.0)] = 0.0
 
@@ -68,11 +68,11 @@ class DriveTrain:
     gear_ratio: Annotated[float, Sourced("", 1.0, 1000.0)]
     gear_efficiency: Annotated[float, Sourced("", 0.1, 1.0)]
     no_load_speed_radps: Annotated[float, Sourced("rad/s", 1.0, 10000.0)]
-    stall_torque_nm: Annotated[float, Sourced("N m", 0.0001, 2000.0)]
-    torque_limit_nm: Annotated[float, Sourced("N m", 0.0001, 2000.0)]
+    stall_torque_nm: Annotated[float, Sourced("N m", 1e-5, 1e5)]
+    torque_limit_nm: Annotated[float, Sourced("N m", 1e-5, 1e5)]
     supply_v: Annotated[float, Sourced("V", 1.0, 1000.0)]
-    speed_loop_p_nms: Annotated[float, Sourced("N m s/rad at the wheel", 0.01, 10000.0)]
-    speed_loop_i_nm: Annotated[float, Sourced("N m/rad at the wheel", 0.0, 50000.0)]
+    speed_loop_p_nms: Annotated[float, Sourced("N m s/rad at the wheel", 1e-5, 1e6)]
+    speed_loop_i_nm: Annotated[float, Sourced("N m/rad at the wheel", 0.0, 5e6)]
     lag_s: Annotated[float, Sourced("s", 0.001, 1.0)]
     dead_time_s: Annotated[float, Sourced("s", 0.0, 2.0)]
     max_speed_mps: Annotated[float, Sourced("m/s", 0.05, 50.0)]

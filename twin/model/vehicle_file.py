@@ -29,6 +29,7 @@ PLACES = {
 INERTIA, SIZE = ("body", "yaw_inertia_kgm2"), ("mass_kg", "wheel_radius_m", "track_m")
 Powers = Mapping[tuple[str, ...], tuple[int, int, int]]
 RESIZED: Powers = {
+    ("body", "payload_max_kg"): (1, 0, 0),
     INERTIA: (1, 0, 2),
     ("body", "wheelbase_m"): (0, 0, 1),
     ("body", "cg_height_m"): (0, 1, 0),
@@ -37,11 +38,13 @@ RESIZED: Powers = {
     ("drive", "no_load_speed_radps"): (0, -1, 0),
     ("drive", "stall_torque_nm"): (1, 1, 0),
     ("drive", "torque_limit_nm"): (1, 1, 0),
-    ("drive", "speed_loop_p_nms"): (1, 1, 0),
-    ("drive", "speed_loop_i_nm"): (1, 1, 0),
+    ("drive", "speed_loop_p_nms"): (1, 2, 0),
+    ("drive", "speed_loop_i_nm"): (1, 2, 0),
 }
 """Numbers of the generic vehicle, and the powers of the numbers `SIZE` with which they grow: a robot of its
-shape, as fast, and as strong for its weight."""
+shape, as fast, as strong for its weight, and as quick to follow its commands."""
+BY_SENSORS = "as known of the robot's sensors"
+"""Source of errors of the twin's sensors that a file's section `robot` makes."""
 MEASURED = ("measured", "field log")
 """Beginnings of sources of numbers that were measured on the robot of the file."""
 
@@ -57,10 +60,42 @@ def read_vehicle(name_or_path: str | Path) -> tuple[dict[str, Any], str]:
         from terrafusion.twin.effects.catalogue import by_key
 
         try:
-            return {**raw, "effects": by_key(raw["effects"])}, file
+            raw = {**raw, "effects": by_key(raw["effects"])}
         except ConfigError as error:
             raise ConfigError(error.what, file=file, remedy=error.remedy) from error
-    return raw, file
+    return _with_sensor_errors(raw), file
+
+
+def _with_sensor_errors(raw: dict[str, Any]) -> dict[str, Any]:
+    """The twin's fixes are as late, and its gyro is as wrong, as is known of the robot's.
+
+    Effects that the file has itself stay.
+    """
+    scale, bias = 1.0 + max(_known(raw, "gyro_scale"), -0.5), _known(raw, "gyro_bias_radps")
+    out, late = dict(raw), _known(raw, "gnss_delay_s")
+    if late and isinstance(raw.get("realism"), Mapping):
+        out["realism"] = {**raw["realism"], "gnss_latency_s": {"value": late, "source": BY_SENSORS}}
+    errors = {"gyro_scale/scale": 1.0 / scale - 1.0, "gyro_bias/constant": bias * scale}
+    effects = dict(raw.get("effects") or {})
+    if any(errors.values()) and isinstance(raw.get("effects", {}), Mapping):
+        from terrafusion.twin.effects.catalogue import lookup
+
+        for key, value in errors.items():
+            own = isinstance(entry := effects.get(key), Mapping) and entry.get("source") != BY_SENSORS
+            if value and not own and abs(value) <= lookup(key)[1].high:
+                effects[key] = {"value": value, "source": BY_SENSORS}
+        out["effects"] = effects
+    return out
+
+
+def _known(raw: dict[str, Any], name: str) -> float:
+    """A number of the file's sensors that is not assumed; 0 for none."""
+    robot = raw.get("robot")
+    entry = robot.get(name) if isinstance(robot, Mapping) else None
+    if not isinstance(entry, Mapping) or entry.get("known") == "assumed":
+        return 0.0
+    value = entry.get("value")
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else 0.0
 
 
 def is_short(raw: dict[str, Any]) -> bool:

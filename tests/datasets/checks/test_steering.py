@@ -118,6 +118,23 @@ def test_encoders_without_a_direction_are_named(seed: int) -> None:
     assert "wheel-unsigned" not in codes(dataclasses.replace(log, wheels=forwards))
 
 
+@pytest.mark.parametrize("gain", [1.0, 0.5])
+def test_front_wheels_may_roll_further_in_tight_curves_alone(gain: float) -> None:
+    log = drive()
+    assert log.wheels is not None
+    assert log.steering is not None
+    v, angle = log.wheels.speed[:, 0], log.steering.angle_rad[:, 0]
+    tangent = np.where(np.abs(angle) > 0.2, np.sign(angle), 0.0)
+    rate = v * tangent / WHEELBASE_M
+    left, right = v - 0.5 * TRACK_M * rate, v + 0.5 * TRACK_M * rate
+    front = (np.hypot(side, WHEELBASE_M * rate) for side in (left, right))
+    names = ("front_left", "front_right", "rear_left", "rear_right")
+    four = Wheels(log.wheels.t_ns, np.stack([*front, gain * left, right], axis=1), names, "mps")
+    steering = Steering(log.steering.t_ns, np.arctan(tangent)[:, None], ("angle",))
+    other = dataclasses.replace(log, wheels=four, steering=steering, imu=None)
+    assert ("wheel-odd" in codes(other)) == (gain != 1.0)
+
+
 def test_samples_that_come_in_bursts_are_spread_evenly() -> None:
     log, rng = drive(), np.random.default_rng(2)
     assert log.imu is not None

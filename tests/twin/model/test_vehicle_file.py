@@ -11,8 +11,10 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.sensors import assumed_sigma
+from terrafusion.datasets.core.yaml_file import dump_yaml
 from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
 from terrafusion.twin.model.vehicle_file import read_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 from terrafusion.twin.simulate import simulate
 
 SHORT = """\
@@ -171,6 +173,9 @@ def test_what_a_short_file_leaves_out_is_in_proportion_to_the_robot(tmp_path: Pa
     assert large.drive.torque_limit_nm == pytest.approx(6.0 * generic.drive.torque_limit_nm)
     assert large.wheel.inertia_kgm2 == pytest.approx(12.0 * generic.wheel.inertia_kgm2)
     assert large.drive.gear_ratio == generic.drive.gear_ratio
+    # As quick to follow commands: the loop's gain over the inertia it moves, m R^2, is the same.
+    assert large.drive.speed_loop_p_nms == pytest.approx(12.0 * generic.drive.speed_loop_p_nms)
+    assert large.drive.speed_loop_i_nm == pytest.approx(12.0 * generic.drive.speed_loop_i_nm)
     top_mps = [v.drive.no_load_speed_radps * v.wheel.radius_m for v in (large, generic)]
     assert top_mps[0] == pytest.approx(top_mps[1])
     loaded = load_vehicle(
@@ -178,6 +183,15 @@ def test_what_a_short_file_leaves_out_is_in_proportion_to_the_robot(tmp_path: Pa
     )
     assert loaded.drive == husky.drive  # a known robot keeps its own motors
     assert loaded.body.yaw_inertia_kgm2 == pytest.approx(2.4 * husky.body.yaw_inertia_kgm2)
+
+
+@pytest.mark.parametrize("mass_kg", [0.1, 50_000.0])
+@pytest.mark.parametrize(("radius_m", "track_m"), [(0.02, 0.05), (2.0, 0.05), (0.02, 5.0), (2.0, 5.0)])
+def test_a_short_file_of_any_size_makes_a_whole_one(mass_kg, radius_m, track_m, tmp_path: Path) -> None:
+    numbers = {"mass_kg": mass_kg, "wheel_radius_m": radius_m, "track_m": track_m}
+    given = {name: {"value": value, "known": "assumed"} for name, value in numbers.items()}
+    own = load_vehicle(dump_yaml(tmp_path / "own.yaml", {"robot": given}))
+    assert (own.body.mass_kg, own.body.payload_max_kg) == (mass_kg, pytest.approx(mass_kg))
 
 
 def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path: Path) -> None:
@@ -190,3 +204,27 @@ def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path:
     assert own.body.mass_kg == 80.0
     with pytest.raises(ConfigError, match="not a rotation"):
         load_vehicle(written(tmp_path / "bad.yaml", "robot: {imu_axes: ['+x', '+y', '-z']}\n"))
+
+
+def test_the_twin_has_the_errors_that_are_known_of_a_robots_sensors(tmp_path: Path) -> None:
+    text = (
+        "robot:\n  extends: elevate\n  gnss_delay_s: {value: -0.3, known: calibrated, sigma: 0.01}\n"
+        "  gyro_scale: {value: 0.25, known: calibrated, sigma: 0.01}\n"
+        "  gyro_bias_radps: {value: 0.01, known: %s, sigma: 0.01}\n"
+        "  wheel_scale: {value: 0.02, known: calibrated, sigma: 0.01}\n"
+    )
+    file = written(tmp_path / "own.yaml", text % "calibrated")
+    short = Scenario("short", 10.0, drive=(DriveSegment(10.0, v_mps=1.0, yaw_rate_radps=0.2),))
+    run, exact = (simulate(short, vehicle=vehicle, seed=2) for vehicle in (file, "elevate"))
+    assert run.gnss.t_ns - exact.gnss.t_ns == pytest.approx(-0.3e9)
+    read, true = (float(log.imu.gyro_radps[:, 2].mean()) for log in (run, exact))
+    assert read == pytest.approx(0.8 * true + 0.01, abs=5e-4)  # the bias drawn is not scaled
+    assert any("do not have wheel_scale of the vehicle's file" in note for note in run.notes)
+    assumed = load_vehicle(written(tmp_path / "own.yaml", text % "assumed"))
+    assert assumed.effects.keys() == {"gyro_scale/scale"}
+    # An effect that the file has itself stays, as `gap` writes it.
+    raw = dict(read_vehicle(file)[0])
+    raw["effects"] = {"gyro_scale": {"value": 0.1, "source": "as a gap analysis finds"}}
+    raw["robot"] = {**raw["robot"], "gyro_bias_radps": {"value": 0.02, "known": "measured", "sigma": 0.1}}
+    again = load_vehicle(dump_yaml(tmp_path / "again.yaml", raw))
+    assert again.effects == pytest.approx({"gyro_scale/scale": 0.1, "gyro_bias/constant": 0.025})

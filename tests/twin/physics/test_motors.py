@@ -222,6 +222,14 @@ def test_immobilisation_tells_when_where_and_why() -> None:
     assert (free.immobilised_at_s, free.immobilised_x_m, free.immobilised_cause) == (None, None, None)
 
 
+def test_a_robot_that_is_commanded_to_creep_moves() -> None:
+    crept = Scenario("rover", 150.0, drive=(DriveSegment(150.0, v_mps=0.04),))
+    summary = simulate_run(crept, noiseless=True).summary
+    assert summary.immobilised_at_s is None
+    assert summary.distance_m == pytest.approx(6.0, rel=0.02)
+    assert 0.0 < summary.mean_abs_slip < 0.05
+
+
 @pytest.mark.parametrize(("wheel_radps", "cause"), [(5.0, TRACTION_LOST), (0.1, MOTOR_STALLED)])
 def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps, cause) -> None:
     setup = set_up("straight")
