@@ -55,6 +55,7 @@ from terrafusion.datasets.readers.text.proposed_map import (
     GEAR,
     TICKS,
     TRACK,
+    has_time,
     left_out,
     second_sensors,
     starter_map,
@@ -148,6 +149,8 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     if "increments" not in proposal:
         open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
+    if not has_time(names, first):
+        ask += f" (no name is a time's: does '{names[0]}' hold seconds?)"
     headers = [header_of(name) for name in names]
     for taken, left in second_sensors(headers).items():
         ask += (
@@ -211,7 +214,7 @@ def _odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, lis
 def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
     """Nanoseconds of the rows, since 1970 where the map gives the epoch."""
     time = column_map.time
-    t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
+    t_ns = columns.times_ns(time.column, time.unit)
     if t_ns is None:
         return _iso_ns(columns, time)
     if time.nanoseconds:
