@@ -56,8 +56,8 @@ SIDES = {
     "right": "right|r",
     "front_left": "front_left|fl|left_front|lf",
     "front_right": "front_right|fr|right_front|rf",
-    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
-    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
+    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr|hind_left|left_hind|lh",
+    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back|hind_right|right_hind|rh",
 }
 _SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
 _SIGMA = "std?_?dev|std|sigma|sd"

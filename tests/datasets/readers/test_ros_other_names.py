@@ -247,6 +247,7 @@ def test_one_driven_axle_is_two_sides(names: list[str]) -> None:
         ("panther/fl_wheel_joint", "front_left"), ("farmbot/left_wheel_joint", "left"),
         ("swarm_1/left_wheel", "left"), ("company_left_wheel", "left"), ("arm_left_wheel", None),
         ("left_arm_joint", None), ("left_arm1_joint", None), ("arms_left", None), ("pan_left", None),
+        ("LH_WHEEL", "rear_left"), ("rh", "rear_right"),
         ("leftFlipper", None), ("caster_left_wheel", None), ("front_left_steering_wheel", None),
     ],
 )  # fmt: skip
