@@ -27,6 +27,9 @@ HINTS = (
     ),
     *((start, "write it with one object a line (.jsonl)") for start in (b"[", b"{")),
     (b"ULog", "export it by ulog2csv of pyulog as tables (.csv)"),
+    (b"\x28\xb5\x2f\xfd", "unpack it, or give the folder of the bag with its metadata.yaml"),
+    (b"\xb5b", "export its NAV-PVT by pyubx2 as a table (.csv), or log NMEA"),
+    (b"FMT,", "give the binary log (.bin) that it was made of"),
 )
 """How to go on with a file that is not read, by its first bytes."""
 OFFICE = (".xlsx", ".xlsm", ".ods", ".npz", ".mat")
