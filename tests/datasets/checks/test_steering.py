@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.checks.summary import clock
 from terrafusion.datasets.core.channels import Imu, Steering, Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
 
@@ -126,6 +127,8 @@ def test_samples_that_come_in_bursts_are_spread_evenly() -> None:
     read_ns = (burst + 1) * 50_000_000 + 100_000 * (k % 5) + rng.integers(0, 200_000, burst[-1] + 1)[burst]
     bursts = dataclasses.replace(log, imu=dataclasses.replace(log.imu, t_ns=read_ns))
     assert codes(bursts) == {"uneven-sampling"}
+    rates = [clock(0, one.imu.t_ns)["rate_hz"] for one in (bursts, log) if one.imu is not None]
+    assert rates == pytest.approx([IMU_HZ, IMU_HZ], rel=0.01)  # not the 10 kHz inside a burst
     repaired, _ = repair(bursts)
     assert repaired.imu is not None
     assert codes(repaired) == set()
