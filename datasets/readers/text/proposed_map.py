@@ -161,6 +161,20 @@ def _time_of(headers: Sequence[Header], cells: Mapping[str, str]) -> Header | No
     return next(iter([*stamps, *of_day, *times, *others]), None)
 
 
+def wheels_of(columns: Sequence[str]) -> str:
+    """The map's section of wheels for fields of a bag, such as /left_ticks.data; "" where none has a name."""
+    found: dict[str, str] = {}
+    for column in columns:
+        for name in (column.removesuffix(".data"), column.rpartition(".")[2]):
+            header = header_of(name)
+            fields = [field for channel, field in guesses(header) if channel == "wheels"]
+            if fields and fields[0] not in found:
+                found[fields[0]] = _entry(replace(header, column=column), fields[0])
+                break
+    section = _complete({"wheels": found}).get("wheels", {})
+    return ", ".join(f"{field}: {entry}" for field, entry in section.items())
+
+
 def second_sensors(headers: Sequence[Header]) -> dict[str, list[str]]:
     """Columns of all but the first of several sensors alike, by the first column of the first."""
     found = {}

@@ -60,7 +60,12 @@ from terrafusion.datasets.readers.text.proposed_map import (
     second_sensors,
     starter_map,
 )
-from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
+from terrafusion.datasets.readers.text.text_columns import (
+    NamedColumns,
+    ParquetColumns,
+    TextColumns,
+    numbered,
+)
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
@@ -180,24 +185,24 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
     t_s = times.t_ns - start_ns
-    track_m, track_notes = _odometry_track(request, column_map)
+    track_m, track_notes = odometry_track(request, column_map)
     tables = {
-        name: _table(columns, of, times.order, t_s, request.path, track_m, column_map.held.get(name))
+        name: table_of(columns, of, times.order, t_s, request.path, track_m, column_map.held.get(name))
         for name, of in fields.items()
     }
-    reader = _Reader(tables, meta, rig=request.rig)
+    reader = TableReader(tables, meta, rig=request.rig)
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
     notes += [*time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
-    notes += _increments_note(channels["wheels"], fields.get("wheels", {}), "wheels" in column_map.held)
+    notes += increments_note(channels["wheels"], fields.get("wheels", {}), "wheels" in column_map.held)
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
     return apply(recording, column_map.conventions())
 
 
-def _odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, list[str]]:
+def odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, list[str]]:
     """Track (m) of an odometry that gives speed and yaw rate, and a note; nan where it gives wheels.
 
     Raises:
@@ -289,8 +294,8 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
     return t_ns + dates_to_ns([time.epoch])[0], ["times without an offset are taken as UTC"]
 
 
-def _table(
-    columns: TableColumns,
+def table_of(
+    columns: NamedColumns,
     fields: Mapping[str, MappedColumn],
     order: Any,
     t_ns: TimesNs,
@@ -329,7 +334,7 @@ def _table(
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 
-def _increments_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn], held: bool) -> list[str]:
+def increments_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn], held: bool) -> list[str]:
     """A note where the angles of wheels, which have no speeds, stay within a turn, as increments do; or where
     no increment comes once, as where rows hold them."""
     if wheels is None or wheels.angle_rad is None or not all(name.endswith("_rad") for name in fields):
@@ -387,7 +392,7 @@ def _signs(letters: NDArray[Any], column: str) -> Array:
     return np.array([signs[word.strip().upper()] for word in words])[inverse]
 
 
-def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
+def _words(columns: NamedColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     """Texts (N,) of a column; codes of fixes in words."""
     texts = columns.texts(of.column)
     if name != "fix" or not of.unit:
@@ -405,7 +410,7 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     return np.array(meanings, dtype=object)[inverse]
 
 
-class _Reader(ChannelReader):
+class TableReader(ChannelReader):
     """Channels of a table; a GNSS channel may be in latitude and longitude, and without sigmas."""
 
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}

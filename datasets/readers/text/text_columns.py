@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,14 @@ _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 _THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?")
 _QUOTED_COMMA = re.compile(rb'"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)"')
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
+
+
+class NamedColumns(Protocol):
+    """Columns (N,) of numbers and texts by name."""
+
+    def numbers(self, name: str) -> NDArray[np.float64]: ...
+
+    def texts(self, name: str) -> NDArray[Any]: ...
 
 
 class TextColumns:
