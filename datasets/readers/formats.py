@@ -1,5 +1,6 @@
 """The formats that can be read: which module recognises a file and reads it (how to add one: `readers`)."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -154,6 +155,15 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
             remedy=f"{first}; what can be read: {kinds}",
         )
     return found
+
+
+def append_parts(names: Sequence[str]) -> str:
+    """How tables whose names differ by a number alone become one; "" for others."""
+    stems = {re.sub(r"\d+(?=\.\w+$)", "*", name) for name in names}
+    pattern = stems.pop() if len(stems) == 1 else ""
+    if len(names) < 2 or not pattern.endswith(("*.csv", "*.tsv", "*.txt")):
+        return ""
+    return f"append them: `cat {pattern} > drive{pattern[-4:]}` (headers that come again are left out)"
 
 
 def logs_in(folder: Path) -> list[str]:
