@@ -133,3 +133,20 @@ def test_samples_that_come_in_bursts_are_spread_evenly() -> None:
     assert repaired.imu is not None
     assert codes(repaired) == set()
     np.testing.assert_allclose(np.diff(repaired.imu.t_ns) * 1e-9, 1.0 / IMU_HZ, rtol=0.01)
+
+
+def test_zeros_for_missing_values_are_found_and_left_out() -> None:
+    """A table at the rate of the IMU, merged with slower wheels: these drove a third as far, unnoticed."""
+    log = drive(spins=True)
+    assert log.wheels is not None
+    filled = dataclasses.replace(
+        log.wheels, speed=log.wheels.speed * (np.arange(len(log.wheels)) % 3 == 0)[:, None]
+    )
+    merged = dataclasses.replace(log, wheels=filled)
+    assert "zero-filled" in codes(merged)
+    repaired, _ = repair(merged)
+    assert repaired.wheels is not None
+    assert codes(repaired) == codes(log) == set()
+    np.testing.assert_array_equal(repaired.wheels.speed[:800], log.wheels.speed[::3])
+    slow = dataclasses.replace(log.wheels, speed=np.rint(2.0 * log.wheels.speed) / 2.0)  # one tick or two
+    assert "zero-filled" not in codes(dataclasses.replace(log, wheels=slow))
