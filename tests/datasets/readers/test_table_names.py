@@ -14,6 +14,7 @@ from tests.datasets.readers.test_table_headers import proposed
     ("names", "fields"),
     [
         ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
+        ("WhlSpdFL,WhlSpdFR,ws_rl,wheelspeed_rr", ["rear_left_mps", "rear_right_mps"]),
         ("LF,RF,LH,RH", ["rear_left_mps", "rear_right_mps"]),
         ("odo_speed,forward_velocity", ["speed_mps"]),
         ("x_utm,y_utm", ["east_m", "north_m"]),
