@@ -129,6 +129,46 @@ def _spike_sizes(values: Array, floor: float) -> Array:
     return size
 
 
+ZERO_ROWS, ZERO_SHARE, ZERO_S = 10, 0.02, 0.5
+"""Runs and share of rows of zeros; no robot stops and is as fast as before within this time."""
+ALIKE, QUANTA = 0.3, 3.0
+"""Relative difference of the rows on both sides of zeros, and their size in the smallest value, a tick's."""
+
+
+def check_zeros(context: CheckContext) -> Iterator[Finding]:
+    """Zeros for missing values: between rows of one speed, or of gravity."""
+    by_channel: dict[str, list[SensorAxes]] = {}
+    for sensor in sensors_of(context.recording):
+        by_channel.setdefault(sensor.channel, []).append(sensor)
+    for channel, sensors in by_channel.items():
+        every = np.hstack([sensor.values[:, sensor.known()] for sensor in sensors])
+        known = np.flatnonzero(np.isfinite(every).all(axis=1))
+        t_ns, values = sensors[0].t_ns[known], every[known]
+        if len(known) < ZERO_ROWS:
+            continue
+        size = np.abs(values).max(axis=1, initial=0.0)
+        edges = np.flatnonzero(np.diff(size == 0.0)) + 1
+        edges = edges[int(size[0] == 0.0) :]
+        first, after = edges[: 2 * (len(edges) // 2)].reshape(-1, 2).T
+        ends = np.stack([size[first - 1], size[after]])
+        short = t_ns[after] - t_ns[first - 1] < ZERO_S * 1e9
+        alike = np.ptp(ends, axis=0) < ALIKE * ends.max(axis=0)
+        large = ends.min(axis=0) > QUANTA * np.abs(values[values != 0.0]).min(initial=np.inf)
+        mask = np.zeros(len(every), dtype=bool)
+        for begin, end in zip(first[short].tolist(), after[short].tolist(), strict=True):
+            mask[known[begin:end]] = True
+        if (short & alike & large).sum() < ZERO_ROWS or mask.mean() < ZERO_SHARE:
+            continue
+        at_s = context.since_start_s(sensors[0].t_ns[int(np.argmax(mask))])
+        yield Finding(
+            "zero-filled", "error", channel,
+            "zeros stand for missing values",
+            f"{mask.mean():.0%} of the rows, within {ZERO_S:g} s of rows alike; first at t = {at_s:.2f} s",
+            "leave these rows out",
+            without_rows(channel, mask),
+        )  # fmt: skip
+
+
 MOST_ROWS = 0.2
 """Where a larger share of the rows is impossible, the unit is wrong rather than some rows."""
 

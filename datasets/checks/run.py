@@ -35,6 +35,7 @@ CHECKS: tuple[Check, ...] = (
     timing.check_duplicates,
     timing.check_rates,
     signals.check_held,
+    outliers.check_zeros,
     signals.check_stuck,
     signals.check_dead,
     signals.check_missing,
@@ -82,6 +83,8 @@ _COMPARED = _SCALES | {"sigma-too-small", "standing", "yaw-unrelated"}
 CONSEQUENCES = {
     ("gyro-in-degrees", "imu"): _COMPARED | {"gyro-bias"},
     ("stuck", "imu"): _COMPARED,
+    ("zero-filled", "imu"): _COMPARED | {"gyro-bias", "accel-magnitude", "uneven-sampling"},
+    ("zero-filled", "wheels"): _COMPARED | {"clock-offset"},
     ("dead", "imu"): _COMPARED,
     ("dead", "wheels"): _COMPARED | {"clock-offset", "carried"},
     ("clock-offset", "gnss"): {"standing", "carried"},

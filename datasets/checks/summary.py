@@ -20,6 +20,9 @@ from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 
+BURST = 2.0
+"""Samples whose median interval is so many times shorter than the mean one come in bursts."""
+
 
 def summarise(recording: Recording, measures: Measures, findings: Sequence[Finding]) -> dict[str, Any]:
     """One recording."""
@@ -84,9 +87,11 @@ def clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
     """Samples, rate, span and gaps of times (N,) of a channel, N at least 1."""
     dt = np.diff(t_ns) * 1e-9
     period = float(np.median(dt)) if len(dt) else 0.0
+    rate, mean = 1.0 / period if period > 0 else None, mean_rate_hz(t_ns)
+    in_bursts = rate is not None and mean is not None and rate > BURST * mean
     return {
         "samples": len(t_ns),
-        "rate_hz": 1.0 / period if period > 0 else None,
+        "rate_hz": mean if in_bursts else rate,
         "start_s": float(t_ns[0] - start_ns) * 1e-9,
         "end_s": float(t_ns[-1] - start_ns) * 1e-9,
         "gaps": int(is_gap(t_ns).sum()),

@@ -1,5 +1,6 @@
 """The formats that can be read: which module recognises a file and reads it (how to add one: `readers`)."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -27,6 +28,9 @@ HINTS = (
     ),
     *((start, "write it with one object a line (.jsonl)") for start in (b"[", b"{")),
     (b"ULog", "export it by ulog2csv of pyulog as tables (.csv)"),
+    (b"\x28\xb5\x2f\xfd", "unpack it, or give the folder of the bag with its metadata.yaml"),
+    (b"\xb5b", "export its NAV-PVT by pyubx2 as a table (.csv), or log NMEA"),
+    (b"FMT,", "give the binary log (.bin) that it was made of"),
 )
 """How to go on with a file that is not read, by its first bytes."""
 OFFICE = (".xlsx", ".xlsm", ".ods", ".npz", ".mat")
@@ -151,6 +155,15 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
             remedy=f"{first}; what can be read: {kinds}",
         )
     return found
+
+
+def append_parts(names: Sequence[str]) -> str:
+    """How tables whose names differ by a number alone become one; "" for others."""
+    stems = {re.sub(r"\d+(?=\.\w+$)", "*", name) for name in names}
+    pattern = stems.pop() if len(stems) == 1 else ""
+    if len(names) < 2 or not pattern.endswith(("*.csv", "*.tsv", "*.txt")):
+        return ""
+    return f"append them: `cat {pattern} > drive{pattern[-4:]}` (headers that come again are left out)"
 
 
 def logs_in(folder: Path) -> list[str]:

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, ChannelReader, read_table
-from terrafusion.datasets.readers.formats import HEAD_BYTES, Request, logs_in
+from terrafusion.datasets.readers.formats import HEAD_BYTES, Request, append_parts, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.timed_tables import in_time
 
@@ -64,6 +64,8 @@ def _as_one(logs: Sequence[str]) -> str:
         return "; if they are one bag, `ros2 bag reindex` writes its metadata.yaml"
     if all(name.endswith(".bag") for name in logs):
         return "; parts of one drive have names that end in _0.bag, _1.bag, ..."
+    if advice := append_parts(logs):
+        return f"; if they are parts of one drive, {advice}"
     return "; for one drive, write a column map beside each table: `terrafusion inspect TABLE` proposes it"
 
 

@@ -186,6 +186,6 @@ def _unused(form: Format, request: Request) -> list[str]:
     used = {"topics": request.topics, "stamps": request.stamps != "header"}
     given = [] if bag else [word for word, value in used.items() if value]
     notes = [f"{' and '.join(given)} only matter for ROS bags; {NOT_USED}"] if given else []
-    if request.columns is not None and form.name != "table":
-        notes.append(f"columns only matter for plain tables; {NOT_USED}")
+    if request.columns is not None and form.name != "table" and not bag:
+        notes.append(f"columns only matter for plain tables and bags; {NOT_USED}")
     return notes

@@ -56,7 +56,7 @@ StampsOption = Annotated[
 ]
 ColumnsOption = Annotated[
     Path | None,
-    typer.Option("--columns", metavar="FILE", help="YAML that describes the columns of a plain table."),
+    typer.Option("--columns", metavar="FILE", help="YAML on columns of a table or fields of a bag."),
 ]
 RepairClockOption = Annotated[
     bool, typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log.")

@@ -2,7 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from terrafusion.datasets.readers.ros.joints import (
     wheel_joints,
     wheels_apart,
 )
+from terrafusion.datasets.readers.ros.mapped import MappedChannels, numbers_in
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.static_frames import (
     STATIC,
@@ -83,23 +84,33 @@ def opened_bag(
 
 
 def chosen_topics(
-    container: BagContainer, request: Request, decide: Callable[[str, list[BagTopic]], BagTopic] | None = None
+    container: BagContainer,
+    request: Request,
+    decide: Callable[[str, list[BagTopic]], BagTopic] | None = None,
+    mapped: Sequence[str] = (),
 ) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes; raises as `choose_topics` does.
 
-    `decide` is asked about several sensors of one kind with data; without it they are an error.
+    `decide` is asked about several sensors of one kind with data; without it they are an error. Channels that
+    a column map describes, `mapped`, get none.
     """
     rig, joints = request.rig, joints_given(request.topics)
+
+    def one_of(kind: str, found: list[BagTopic]) -> BagTopic:
+        return found[0] if kind in mapped else _one_sensor(container, rig, decide, kind, found)
+
     with errors_of(request.path):
         chosen, notes = choose_topics(
             topics_of(container),
             user=request.topics,
             usual=rig.topics if rig else None,
             is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
-            one_of=functools.partial(_one_sensor, container, rig, decide),
+            one_of=one_of,
             is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
         )
-        if "wheels" not in chosen:
+        notes = [note for note in notes if note.partition(":")[0] not in mapped]
+        chosen = {kind: topic for kind, topic in chosen.items() if kind not in mapped}
+        if "wheels" not in (*chosen, *mapped):
             found = wheels_apart(topics_of(container), functools.partial(_joints, container), joints)
             if found is not None:
                 chosen["wheels"] = found
@@ -124,10 +135,11 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
 def _recording(container: BagContainer, request: Request) -> Recording:
     path, rig = request.path, request.rig
     there = {(source.topic, source.msgtype) for source in container.sources if source.count}
-    if META in there and not request.topics and request.stamps == "header":
+    mapped = MappedChannels(request)
+    if META in there and not (request.topics or mapped.kinds) and request.stamps == "header":
         return restore(functools.partial(read_streams, container), there, path)
-    chosen, notes = chosen_topics(container, request)
-    streams = _streams(container, chosen)
+    chosen, notes = chosen_topics(container, request, mapped=mapped.kinds)
+    streams = _streams(container, chosen) | mapped.streams(container, topics_of(container))
     if META in there:
         notes.append(f"{META[0].rpartition('/')[0]} is not used: topics or stamps were asked for")
     notes += [
@@ -143,10 +155,11 @@ def _recording(container: BagContainer, request: Request) -> Recording:
             remedy = f"messages in {', '.join(sorted(others))} are not read: export them as tables (.csv)"
             raise DataError(what, remedy=remedy)
         raise DataError(what, remedy="name one with --topic, such as --topic imu=/imu/data")
-    if "wheels" not in chosen:
+    if "wheels" not in streams:
         taken = [topic.name for kind, topic in chosen.items() if kind not in ("command", "steering")]
-        notes.append(wheel_advice(topics_of(container), taken, functools.partial(_joints, container)))
-    if "gnss" not in chosen:
+        looks = functools.partial(_joints, container), functools.partial(numbers_in, container)
+        notes.append(wheel_advice(topics_of(container), taken, *looks))
+    if "gnss" not in streams:
         notes += unread_receivers(topics_of(container))
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock)
@@ -155,15 +168,19 @@ def _recording(container: BagContainer, request: Request) -> Recording:
     notes += timing.notes
     frames = StaticFrames() if request.sha256 else _static_frames(container, notes)
     builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, notes, frames=frames)
-    return _build(builder, timing, datum)
+    return mapped.applied(_build(builder, mapped, timing, datum))
 
 
-def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | None) -> Recording:
+def _build(
+    builder: ChannelBuilder, mapped: MappedChannels, timing: StreamTimes, datum_stream: Stream | None
+) -> Recording:
     """One channel after the other; the order matters where one looks at another."""
     streams = timing.streams
 
     def built(kind: str, *beside: Any) -> Any:
-        """What the builder makes of the messages of a kind; None without any."""
+        """What the builder, or the column map, makes of the messages of a kind; None without any."""
+        if kind in streams and kind in mapped.kinds:
+            return mapped.channel(kind, streams[kind], timing.times[kind], builder.start_ns)
         return getattr(builder, kind)(streams[kind], timing.times[kind], *beside) if kind in streams else None
 
     imu = built("imu")
@@ -176,7 +193,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
     mounted = _mounted(builder, streams)
     imu_frame = _usual_frame(streams["imu"]) if imu is not None else ""
     truth, frame = built("truth") or (None, "base")
-    others |= {kind: built(kind) for kind in ("command", "terrain", "steering")}
+    others |= {kind: built(kind) for kind in ("command", "terrain", "steering", "motor")}
     return Recording(
         name=builder.file.stem,
         start_ns=builder.start_ns,

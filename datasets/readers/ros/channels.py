@@ -36,6 +36,7 @@ from terrafusion.datasets.readers.ros.joints import (
     joint_values,
     steering_joints,
     wheel_joints,
+    wheel_of_joint,
 )
 from terrafusion.datasets.readers.ros.static_frames import (
     BASE,
@@ -61,6 +62,8 @@ from terrafusion.datasets.readers.timed_tables import new_times
 NOMINAL_TRACK_M = 1.0
 NAVSATFIX = ("latitude", "longitude", "altitude")
 MOVING_MPS = 0.05
+TURNED_RAD = 1.0
+"""Wheels that turned so far did not stand."""
 LEAST_APART = 3
 """Messages of each wheel between which those of wheels apart are interpolated."""
 MOST_WITHOUT_NUMBER = 0.01
@@ -258,13 +261,19 @@ class ChannelBuilder:
             speed, angle = (None if v is None else v[begin:] for v in (speed, angle))
             t_ns = t_ns[begin:]
         chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
-        self.notes.append(f"wheels: joints of {stream.topic}: {chosen}")
+        others = [name for name in names if wheel_of_joint(name) and name not in joints.values()]
+        left = f"; not used: {', '.join(others[: topics.MOST_SHOWN])}" if others else ""
+        self.notes.append(f"wheels: joints of {stream.topic}: {chosen}{left}")
+        turned = angle is not None and bool((np.ptp(angle, axis=0) > TURNED_RAD).any())
+        if speed is not None and turned and not speed.any() and not self.as_written:
+            self.notes.append(f"wheels: all velocities of {stream.topic} are zero, though its angles turn")
+            speed = None
         angle = self._unwrapped(angle, speed, tuple(joints), stream.topic)
         if speed is None and angle is not None and len(t_ns) > 1:
             keep, speed = speeds_of(t_ns, angle)
             angle, t_ns = angle[keep], t_ns[keep]
             self.notes.append(
-                f"wheels: {stream.topic} has no velocities; taken from differences of the angles"
+                f"wheels: {stream.topic} tells no velocities; taken from differences of the angles"
             )
         if speed is None:
             raise DataError("joints have neither velocity nor position", channel=stream.topic)

@@ -20,8 +20,8 @@ _SHORT = {
     for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))
     for s, side in (("l", "left"), ("r", "right"))
 }
-_SHORT |= {f"l{e}": (end, "left") for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))}
-_SHORT |= {"rf": ("front", "right"), "rb": ("rear", "right")}
+_SHORT |= {f"l{e}": (end, "left") for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"), ("h", "rear"))}
+_SHORT |= {"rf": ("front", "right"), "rb": ("rear", "right"), "rh": ("rear", "right")}
 _STEERING = re.compile(r"steer", re.IGNORECASE)
 _NOT_WHEELS = re.compile(
     r"steer|(?<![a-z])(arm|pan|tilt)s?(?![a-z])|flipper|gripper|caster|suspension|rocker|bogie", re.IGNORECASE

@@ -63,7 +63,9 @@ class _Walk:
         self.words: dict[str, tuple[tuple[Place, ...], bool]] = {}
         if cdr:
             if raw[:2] not in (b"\0\0", b"\0\1") or len(raw) < 4:
-                raise BagError("messages are not in plain CDR")
+                packed = raw.startswith(b"\x28\xb5\x2f\xfd")  # by zstd
+                remedy = ": packed one by one; give the folder of the bag, whose metadata.yaml says so"
+                raise BagError(f"messages are not in plain CDR{remedy if packed else ''}")
             self.order = "<" if raw[1] else ">"
             self.position = self.origin = 4
             self.fixed.append((0, 2))

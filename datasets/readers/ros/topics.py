@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.readers.text.proposed_map import wheels_of
 
 IMU = "sensor_msgs/msg/Imu"
 JOINTS = "sensor_msgs/msg/JointState"
@@ -90,7 +91,7 @@ _PART = re.compile(
 """In names of sensors, boards and drivers, which are no robot's."""
 _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
 
-MOST_SHOWN = 8
+MOST_SHOWN, MOST_FIELDS = 8, 20
 _NEVER = re.compile(
     r"^(tf2|rcl_interfaces|rosgraph|diagnostic|visualization|rosbag2)_?\w*/|Image|PointCloud|Log$"
 )
@@ -327,11 +328,14 @@ def unread_receivers(bag: Sequence[BagTopic]) -> list[str]:
     ]
     shown = ", ".join(f"{t.name} ({t.msgtype})" for t in others[:MOST_SHOWN])
     what = f"gnss: not used are {shown}, of types that are not read; record the fixes as {FIX}"
-    return [f"{what}, or give them as a table"] if others else []
+    return [f"{what}, or name their fields by --columns FILE"] if others else []
 
 
 def wheel_advice(
-    bag: Sequence[BagTopic], taken: Sequence[str], joints_of: Callable[[str], Sequence[str]]
+    bag: Sequence[BagTopic],
+    taken: Sequence[str],
+    joints_of: Callable[[str], Sequence[str]],
+    numbers_of: Callable[[BagTopic], Sequence[str]],
 ) -> str:
     """A note for a bag without wheels; other sensors have taken the topics `taken`."""
     others = [topic for topic in bag if topic.name not in taken and not _NEVER.search(topic.msgtype)]
@@ -346,7 +350,12 @@ def wheel_advice(
         more = [f"{len(strange) - MOST_SHOWN} more"] if len(strange) > MOST_SHOWN else []
         parts.append(f"not used are {', '.join([*shown, *more])}, of types that are not read")
     if not parts or not usable:
-        parts.append(f"record the speeds as {JOINTS} or {ODOMETRY}, or give them as a table")
+        columns = [column for topic in strange[:MOST_SHOWN] for column in numbers_of(topic)]
+        section = wheels_of(columns) or "left_radps: /TOPIC.FIELD, right_radps: /TOPIC.FIELD"
+        how = f"name fields, with the right units, by --columns FILE: {{channels: {{wheels: {{{section}}}}}}}"
+        listed = f" (there are {', '.join(columns[:MOST_FIELDS])})" if columns else ""
+        other = f"{how}{listed}" if columns else "give them as a table"
+        parts.append(f"record the speeds as {JOINTS} or {ODOMETRY}, or {other}")
     return f"wheels: no topic was chosen for them, and replay needs them: {'; '.join(parts)}"
 
 

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.conventions import BODY_AXES, HELD_CHANNELS, Conv
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Word, shown
+from terrafusion.datasets.core.recording import Overrides
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import COLUMNS, GNSS_SIGMA, TRUTH_TWIST
@@ -168,6 +169,8 @@ class ColumnMapFile(DescriptionFile):
     held: dict[str, Annotated[float, ROWS]] = field(default_factory=dict)
 
 
+TABLE_KEYS = tuple(f.name for f in dataclasses.fields(ColumnMapFile))
+BAG_KEYS = ("channels", "imu_axes", "held", *(f.name for f in dataclasses.fields(Overrides)))
 META_KEYS = tuple(f.name for f in dataclasses.fields(DescriptionFile))
 
 
@@ -202,13 +205,17 @@ class ColumnMap(ColumnMapFile):
         return hemispheres | {of.column for name, of in fields if name in TEXT_FIELDS}
 
 
-def read_column_map(path: Path) -> ColumnMap:
-    """Read and check a column map.
+def read_column_map(path: Path, *, of_bag: bool = False) -> ColumnMap:
+    """Read and check a column map, of a table or of fields of a bag's messages.
 
     Raises:
         ConfigError: unknown key, channel, field, unit or sign, a value of the wrong type.
     """
     raw = {key: value for key, value in read_yaml(path).items() if value is not None}
+    if of_bag:
+        foreign = [key for key in raw if key in TABLE_KEYS and key not in BAG_KEYS]
+        refuse([(f"'{key}' is of tables, not of bags", "remove it") for key in foreign], path)
+        raw["time"] = "header.stamp"
     found = structure(ColumnMapFile, raw, file=path)
     refuse(_problems(found), path)
     meta = parse_meta({key: raw[key] for key in META_KEYS if key in raw} | {"start_ns": 0}, path)

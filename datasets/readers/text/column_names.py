@@ -56,10 +56,10 @@ SIDES = {
     "right": "right|r",
     "front_left": "front_left|fl|left_front|lf",
     "front_right": "front_right|fr|right_front|rf",
-    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr",
-    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back",
+    "rear_left": "rear_left|rl|back_left|bl|left_rear|left_back|lr|hind_left|left_hind|lh",
+    "rear_right": "rear_right|rr|back_right|br|right_rear|right_back|hind_right|right_hind|rh",
 }
-_SPEED = r"(?:(?:ground|track|wheel|drive|chain|tyre|tire)_)?(?:v|vel|velocity|speed)|wheel"
+_SPEED = r"(?:(?:ground|track|wheel|whl|drive|chain|tyre|tire)_?)?(?:v|vel|velocity|speed|spd)|wheel|ws"
 _SIGMA = "std?_?dev|std|sigma|sd"
 _ROTATION = "w|omega|rpm"
 _TURNED = "ticks?|counts?|pulses?|enc|encoder|angle|pos|position"
@@ -104,7 +104,7 @@ _PATTERNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ),
     *(
         (
-            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope)_?{a}|gyro_rad_{i}|w_rs_s_{a}",
+            rf"(?:g|gyr|gyro|w|omega|angular_velocity|angular_rate|ang_vel|gyroscope|rotation_rate)_?{a}|gyro_rad_{i}|w_rs_s_{a}",
             "imu",
             (f"gyro_{a}_radps",),
         )

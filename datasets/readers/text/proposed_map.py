@@ -44,8 +44,11 @@ _SCALED = 1e6
 (as u-blox and MAVLink have them)."""
 _LONGEST_STEP_S = 2.0
 """Rows of a drive are not farther apart: larger steps of a time are in a smaller unit (assumed)."""
+_LONGEST_DATED_S = 10.0
+"""Nor are dated rows so far apart: ms, us or ns since a start may have the size of dates (assumed)."""
 _IN_G = (0.85, 1.15)
 """Size of a specific force of a robot at rest that is in g."""
+_CLOCK = re.compile(r"\d:\d\d:\d\d")
 _NMEA_DATE = re.compile(r"^([0-3]\d)([01]\d)(\d\d)$")
 _NEAR_GROUND_M = (6.3e6, 6.4e6)
 """Distances of ground robots from the centre of the Earth: x, y, z are ECEF."""
@@ -101,9 +104,7 @@ def starter_map(
             header if header.unit else replace(header_of(f"{header.column} [{unit}]"), column=names[k])
         )
     cells = dict(zip(names, first, strict=False))
-    times = [h for h in headers if TIME.search(h.base)]
-    of_day = [h for h in times if _cell_of_day(h, cells)]
-    time = next((h for h in times if h.base == "header_stamp"), [*of_day, *times, headers[0]][0])
+    time = _time_of(headers, cells) or headers[0]
     rest = _nanoseconds(time.column, names)
     channels: dict[str, dict[str, str]] = {}
     others = {name for several in second_sensors(headers).values() for name in several}
@@ -129,7 +130,8 @@ def starter_map(
     if "1e-7 deg" in gnss.get("latitude_deg", ""):  # a receiver's own integers
         for header in headers:
             for channel, field in guesses(header):
-                whole = field == "height_m" or _WHOLE.fullmatch(cells.get(header.column, ""))
+                cell = cells.get(header.column, "")
+                whole = _WHOLE.fullmatch(cell.removesuffix(".0") if field == "height_m" else cell)
                 small = {"m": "mm", "mps": "mm/s"}.get(field.rpartition("_")[2], "")
                 if channel == "gnss" and field in gnss and small and whole and not header.unit:
                     gnss[field] = _entry(replace(header, unit=small), field)
@@ -143,6 +145,34 @@ def starter_map(
     entry = _time_entry(time, cells.get(time.column, ""), rest, day, sample(time.column))
     track = f"{TRACK}, " if YAW_RATE in channels.get("wheels", {}) else ""
     return f"time: {entry}, {track}channels: {{{sections}}}"
+
+
+def has_time(names: Sequence[str], first: Sequence[str]) -> bool:
+    """Whether a column is a time by its name, or by its first cell."""
+    return _time_of([header_of(name) for name in names], dict(zip(names, first, strict=False))) is not None
+
+
+def _time_of(headers: Sequence[Header], cells: Mapping[str, str]) -> Header | None:
+    """The column of the times: by its name, else by a first cell with hours, minutes and seconds."""
+    times = [h for h in headers if TIME.search(h.base)]
+    stamps = [h for h in times if h.base == "header_stamp"]
+    of_day = [h for h in times if _cell_of_day(h, cells)]
+    others = [h for h in headers if _CLOCK.search(cells.get(h.column, ""))]
+    return next(iter([*stamps, *of_day, *times, *others]), None)
+
+
+def wheels_of(columns: Sequence[str]) -> str:
+    """The map's section of wheels for fields of a bag, such as /left_ticks.data; "" where none has a name."""
+    found: dict[str, str] = {}
+    for column in columns:
+        for name in (column.removesuffix(".data"), column.rpartition(".")[2]):
+            header = header_of(name)
+            fields = [field for channel, field in guesses(header) if channel == "wheels"]
+            if fields and fields[0] not in found:
+                found[fields[0]] = _entry(replace(header, column=column), fields[0])
+                break
+    section = _complete({"wheels": found}).get("wheels", {})
+    return ", ".join(f"{field}: {entry}" for field, entry in section.items())
 
 
 def second_sensors(headers: Sequence[Header]) -> dict[str, list[str]]:
@@ -272,7 +302,7 @@ def _day(headers: Sequence[Header], time: Header, cells: Mapping[str, str]) -> s
 
 def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[float]) -> str:
     name = json.dumps(time.column, ensure_ascii=False)
-    unit, epoch = time.unit or UNIT_OF.get(time.base, ""), "unix"
+    unit = time.unit or UNIT_OF.get(time.base, "")
     unit = unit if unit in TIME_UNITS else ""
     since = f", epoch: {json.dumps(day)}" if day else ""
     value = number_in(cell.removesuffix(" sec").replace(",", "."))
@@ -285,12 +315,11 @@ def _time_entry(time: Header, cell: str, rest: str, day: str, sample: Sequence[f
         unit = unit or ("ms" if abs(value) > WEEK_S or time.base == "i_tow" else "s")
         return f"{{column: {name}, unit: {unit}{since or ', epoch: none'}}}"
     size = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # in 2001
-    unit = unit or next((known for known in ("ns", "us", "ms") if abs(value) >= size[known]), "")
+    dated = unit or next((known for known in TIME_UNITS[::-1] if abs(value) >= size[known]), "s")
     step = float(np.median(np.diff(sample))) if len(sample) > 1 else 0.0
-    if not unit and abs(value) < 0.1 * size["s"] and step == round(step):
+    uptime = abs(value) < size[dated] or (not unit and step > _LONGEST_DATED_S * size[dated] * 1e-9)
+    if not unit and uptime and step == round(step):
         unit = next((known for known in TIME_UNITS if step <= _LONGEST_STEP_S * size[known] * 1e-9), "")
-    unit = unit or "s"
-    if abs(value) < 0.1 * size[unit]:
-        epoch = "none"
+    unit, epoch = unit or dated, "none" if uptime else "unix"
     split = f", nanoseconds: {json.dumps(rest, ensure_ascii=False)}" if rest else ""
     return f"{{column: {name}, unit: {unit}, epoch: {epoch}{split}}}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array, TimesNs, distinct
 from terrafusion.datasets.core.channels import Gnss, Wheels
-from terrafusion.datasets.core.conventions import apply
+from terrafusion.datasets.core.conventions import apply, true_updates
 from terrafusion.datasets.core.decimals import (
     DAY_NS,
     OF_CLOCK,
@@ -55,11 +55,17 @@ from terrafusion.datasets.readers.text.proposed_map import (
     GEAR,
     TICKS,
     TRACK,
+    has_time,
     left_out,
     second_sensors,
     starter_map,
 )
-from terrafusion.datasets.readers.text.text_columns import ParquetColumns, TextColumns, numbered
+from terrafusion.datasets.readers.text.text_columns import (
+    NamedColumns,
+    ParquetColumns,
+    TextColumns,
+    numbered,
+)
 from terrafusion.datasets.readers.timed_tables import TimedTable, new_times, row_times
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
@@ -148,6 +154,8 @@ def _mapless(path: Path, columns: TableColumns) -> DataError:
     if "increments" not in proposal:
         open_scales[TICKS] += " where they begin again with each row, add increments: true"
     ask = "".join(f" ({scale}: {question})" for scale, question in open_scales.items() if scale in proposal)
+    if not has_time(names, first):
+        ask += f" (no name is a time's: does '{names[0]}' hold seconds?)"
     headers = [header_of(name) for name in names]
     for taken, left in second_sensors(headers).items():
         ask += (
@@ -177,23 +185,24 @@ def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, n
     meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
     fields = {name: fields for name, fields in column_map.channels.items() if fields}
     t_s = times.t_ns - start_ns
-    track_m, track_notes = _odometry_track(request, column_map)
+    track_m, track_notes = odometry_track(request, column_map)
     tables = {
-        name: _table(columns, of, times.order, t_s, request.path, track_m) for name, of in fields.items()
+        name: table_of(columns, of, times.order, t_s, request.path, track_m, column_map.held.get(name))
+        for name, of in fields.items()
     }
-    reader = _Reader(tables, meta, rig=request.rig)
+    reader = TableReader(tables, meta, rig=request.rig)
     channels = {name: reader.channel(name) for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", remedy="check the column map")
     notes += [*time_notes, *columns.notes, *times.notes, *track_notes, *reader.notes]
-    notes += _standing_note(channels["wheels"], fields.get("wheels", {}))
+    notes += increments_note(channels["wheels"], fields.get("wheels", {}), "wheels" in column_map.held)
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
     return apply(recording, column_map.conventions())
 
 
-def _odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, list[str]]:
+def odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, list[str]]:
     """Track (m) of an odometry that gives speed and yaw rate, and a note; nan where it gives wheels.
 
     Raises:
@@ -211,7 +220,7 @@ def _odometry_track(request: Request, column_map: ColumnMap) -> tuple[float, lis
 def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
     """Nanoseconds of the rows, since 1970 where the map gives the epoch."""
     time = column_map.time
-    t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
+    t_ns = columns.times_ns(time.column, time.unit)
     if t_ns is None:
         return _iso_ns(columns, time)
     if time.nanoseconds:
@@ -285,16 +294,17 @@ def _iso_ns(columns: TableColumns, time: TimeColumn) -> tuple[NDArray[np.int64],
     return t_ns + dates_to_ns([time.epoch])[0], ["times without an offset are taken as UTC"]
 
 
-def _table(
-    columns: TableColumns,
+def table_of(
+    columns: NamedColumns,
     fields: Mapping[str, MappedColumn],
     order: Any,
     t_ns: TimesNs,
     path: Path,
     track_m: float,
+    held: float | None,
 ) -> TimedTable:
     """The mapped columns of a channel in SI units, its rows in the `order` of their times; speed and yaw rate
-    as the sides' speeds that an odometry of that track makes them of."""
+    as the sides' speeds that an odometry of that track makes them of; increments `held` for rows once."""
     texts = {name: _words(columns, name, of)[order] for name, of in fields.items() if name in TEXT_FIELDS}
     numbers = {}
     for name, of in fields.items():
@@ -305,11 +315,15 @@ def _table(
                 values = _degrees(values, of.column)
             if of.hemisphere:
                 values = values * _signs(columns.texts(of.hemisphere)[order], of.hemisphere)
-            if of.increments:
-                values = np.where(np.isnan(values), np.nan, np.nancumsum(values))
             numbers[name] = values if factor == 1.0 else values * factor
             if of.unit == VARIANCE:  # zero and below: the receiver knows none
                 numbers[name] = np.sqrt(np.where(numbers[name] <= 0.0, np.nan, numbers[name]))
+    if counted := [name for name, of in fields.items() if of.increments]:
+        steps = np.stack([numbers[name] for name in counted], axis=1)
+        steps[~true_updates(steps, round(held or 1))] = np.nan
+        numbers |= dict(
+            zip(counted, np.where(np.isnan(steps), np.nan, np.nancumsum(steps, axis=0)).T, strict=True)
+        )
     if "yaw_rad" in numbers:
         yaw = numbers.pop("yaw_rad")
         rpy = np.stack([np.zeros(len(yaw)), np.zeros(len(yaw)), yaw], axis=1)
@@ -320,10 +334,22 @@ def _table(
     return TimedTable(t_ns=t_ns, path=path, numbers=numbers, texts=texts)
 
 
-def _standing_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn]) -> list[str]:
-    """A note where the angles of wheels, which have no speeds, stay within a turn: increments do."""
+def increments_note(wheels: Wheels | None, fields: Mapping[str, MappedColumn], held: bool) -> list[str]:
+    """A note where the angles of wheels, which have no speeds, stay within a turn, as increments do; or where
+    no increment comes once, as where rows hold them."""
     if wheels is None or wheels.angle_rad is None or not all(name.endswith("_rad") for name in fields):
         return []
+    steps = np.diff(wheels.angle_rad, axis=0).round(9)
+    begins = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1)) + 1
+    runs = np.diff(begins)[steps[begins[:-1]].any(axis=1)]
+    if (
+        any(of.increments for of in fields.values())
+        and not held
+        and len(runs) > LEAST_ROWS
+        and runs.min() > 1
+    ):
+        rows = np.bincount(runs).argmax()
+        return [f"wheels: increments stay for {rows} rows: if these hold them, add held: {{wheels: {rows}}}"]
     range_rad, span_s = float(np.ptp(wheels.angle_rad, axis=0).max()), np.ptp(wheels.t_ns) * 1e-9
     if range_rad > 2.0 * math.pi or span_s < LONG_S:
         return []
@@ -366,7 +392,7 @@ def _signs(letters: NDArray[Any], column: str) -> Array:
     return np.array([signs[word.strip().upper()] for word in words])[inverse]
 
 
-def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
+def _words(columns: NamedColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     """Texts (N,) of a column; codes of fixes in words."""
     texts = columns.texts(of.column)
     if name != "fix" or not of.unit:
@@ -384,7 +410,7 @@ def _words(columns: TableColumns, name: str, of: MappedColumn) -> NDArray[Any]:
     return np.array(meanings, dtype=object)[inverse]
 
 
-class _Reader(ChannelReader):
+class TableReader(ChannelReader):
     """Channels of a table; a GNSS channel may be in latitude and longitude, and without sigmas."""
 
     REQUIRED: ClassVar[dict[str, tuple[str, ...]]] = ChannelReader.REQUIRED | {"gnss": ()}

@@ -14,7 +14,7 @@ import numpy as np
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
-from terrafusion.datasets.readers.formats import MAP_SUFFIX, Request, format_of
+from terrafusion.datasets.readers.formats import MAP_SUFFIX, Request, append_parts, format_of
 from terrafusion.datasets.readers.log_folder import META
 
 JOINED = ("table", "nmea", "rtklib_pos", "xsens_text", "tum")
@@ -76,6 +76,8 @@ def _joined(folder: Path, parts: Mapping[str, Recording]) -> Recording:
             if channel in owner:
                 what = f"{owner[channel]} and {name} both have it"
                 remedy = "remove one from its column map, or give one of the files itself"
+                if advice := append_parts([owner[channel], name]):
+                    remedy += f"; if they are parts of one drive, {advice}"
                 raise DataError(what, file=folder, channel=channel, remedy=remedy)
             owner[channel] = name
     _check_clock(folder, parts)

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,14 @@ _EXCEL = re.compile(r"sep=.", re.IGNORECASE)
 _THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d*)?")
 _QUOTED_COMMA = re.compile(rb'"([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)"')
 _COMMA, _POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
+
+
+class NamedColumns(Protocol):
+    """Columns (N,) of numbers and texts by name."""
+
+    def numbers(self, name: str) -> NDArray[np.float64]: ...
+
+    def texts(self, name: str) -> NDArray[Any]: ...
 
 
 class TextColumns:
@@ -106,9 +114,9 @@ class TextColumns:
         """A column of texts (N,)."""
         return self._table.texts[name]
 
-    def times_ns(self, name: str, unit: str) -> NDArray[np.int64]:
-        """A column of decimal times as ns (N,)."""
-        return self._table.times_ns(name, unit)
+    def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None:
+        """A column of decimal times as ns (N,); None where they are dates."""
+        return None if unit == "iso8601" else self._table.times_ns(name, unit)
 
 
 def numbered(count: int) -> list[str]:
@@ -281,22 +289,26 @@ class ParquetColumns:
         self._table: Any = None
 
     def first_cells(self) -> list[str]:
-        """None: the kinds of the columns say what they hold."""
-        return []
+        """The first value of each column as text, "" where none of the first rows has one."""
+        found = (next((cell for cell in self._first(name) if cell is not None), "") for name in self.names)
+        return [str(cell) for cell in found]
 
     def sample(self, name: str) -> list[float]:
         """The numbers of a column in the first rows."""
+        cells = (cell for cell in self._first(name) if isinstance(cell, (int, float)))
+        return [float(cell) for cell in cells if math.isfinite(cell)]
+
+    def _first(self, name: str) -> list[Any]:
+        """A column in the first rows, None where it is null, [] of lists."""
         import pyarrow as pa
 
-        kind = self._file.schema_arrow.field(name).type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        if pa.types.is_nested(self._file.schema_arrow.field(name).type):
             return []
         try:
             batch = next(self._file.iter_batches(SAMPLE_ROWS, columns=[name]), None)
         except self._refused as error:
             raise self._damaged(error) from None
-        cells = [] if batch is None else batch.column(0).to_pylist()
-        return [float(cell) for cell in cells if cell is not None and math.isfinite(cell)]
+        return [] if batch is None else batch.column(0).to_pylist()
 
     def read(self, column_map: ColumnMap) -> None:
         """Read the mapped columns; texts stay packed until they are asked for."""
@@ -363,9 +375,9 @@ class ParquetColumns:
         return np.concatenate(parts)
 
     def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None:
-        """A column of times in ns (N,); None where it holds texts.
+        """A column of times in ns (N,); None where it holds texts, or numbers that are dates.
 
-        Numbers are in `unit`; typed time stamps carry their own, and are in UTC.
+        Numbers are in `unit`; typed time stamps and differences of them carry their own, in UTC.
         """
         import pyarrow as pa
 
@@ -376,6 +388,10 @@ class ParquetColumns:
         try:
             if pa.types.is_timestamp(kind):
                 return np.asarray(column.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy())
+            if pa.types.is_duration(kind):
+                return np.asarray(column.cast(pa.duration("ns")).cast(pa.int64()).to_numpy())
+            if unit == "iso8601":
+                return None
             if pa.types.is_integer(kind):
                 whole = column.cast(pa.int64()).to_numpy()
                 if max(int(whole.max(initial=0)), -int(whole.min(initial=0))) < 2**63 // NS_PER.get(unit, 1):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.checks.summary import clock
 from terrafusion.datasets.core.channels import Imu, Steering, Wheels
 from terrafusion.datasets.core.recording import Overrides, Recording
 
@@ -143,7 +144,26 @@ def test_samples_that_come_in_bursts_are_spread_evenly() -> None:
     read_ns = (burst + 1) * 50_000_000 + 100_000 * (k % 5) + rng.integers(0, 200_000, burst[-1] + 1)[burst]
     bursts = dataclasses.replace(log, imu=dataclasses.replace(log.imu, t_ns=read_ns))
     assert codes(bursts) == {"uneven-sampling"}
+    rates = [clock(0, one.imu.t_ns)["rate_hz"] for one in (bursts, log) if one.imu is not None]
+    assert rates == pytest.approx([IMU_HZ, IMU_HZ], rel=0.01)  # not the 10 kHz inside a burst
     repaired, _ = repair(bursts)
     assert repaired.imu is not None
     assert codes(repaired) == set()
     np.testing.assert_allclose(np.diff(repaired.imu.t_ns) * 1e-9, 1.0 / IMU_HZ, rtol=0.01)
+
+
+def test_zeros_for_missing_values_are_found_and_left_out() -> None:
+    """A table at the rate of the IMU, merged with slower wheels: these drove a third as far, unnoticed."""
+    log = drive(spins=True)
+    assert log.wheels is not None
+    filled = dataclasses.replace(
+        log.wheels, speed=log.wheels.speed * (np.arange(len(log.wheels)) % 3 == 0)[:, None]
+    )
+    merged = dataclasses.replace(log, wheels=filled)
+    assert "zero-filled" in codes(merged)
+    repaired, _ = repair(merged)
+    assert repaired.wheels is not None
+    assert codes(repaired) == codes(log) == set()
+    np.testing.assert_array_equal(repaired.wheels.speed[:800], log.wheels.speed[::3])
+    slow = dataclasses.replace(log.wheels, speed=np.rint(2.0 * log.wheels.speed) / 2.0)  # one tick or two
+    assert "zero-filled" not in codes(dataclasses.replace(log, wheels=slow))

@@ -25,7 +25,7 @@ START_NS = 1_700_000_000_123_456_789
 CODES = {
     "no-common-time", "clock-jump", "clock-drift", "clock-offset", "coarse-times", "uneven-sampling", "gaps",
     "repeated-times", "held-values", "stuck", "dead", "missing-values", "saturated", "spikes",
-    "impossible-value",
+    "impossible-value", "zero-filled",
 }  # fmt: skip
 
 

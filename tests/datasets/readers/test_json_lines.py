@@ -73,7 +73,9 @@ def test_a_line_that_is_no_object_is_named(tmp_path: Path, line: str) -> None:
     ("name", "head", "hint"),
     [("drive.zip", b"PK\x03\x04", "unpack it"), ("a.xlsx", b"PK\x03\x04", "export it as a table"),
      ("a.json", b'[\n{"t": 0}]', "one object a line"),
-     ("a.ulg", b"ULog\x01", "ulog2csv")],
+     ("a.ulg", b"ULog\x01", "ulog2csv"), ("a.ubx", b"\xb5b\x01\x07", "NAV-PVT"),
+     ("00000042.log", b"FMT, 128, 89, FMT, BBnNZ\n", "binary log"),
+     ("a.db3.zstd", b"\x28\xb5\x2f\xfd\x04", "folder of the bag with its metadata.yaml")],
 )  # fmt: skip
 def test_files_that_need_a_step_first_are_refused_with_it(
     tmp_path: Path, name: str, head: bytes, hint: str

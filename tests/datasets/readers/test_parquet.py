@@ -70,6 +70,34 @@ def test_numbers_of_parquet_tell_what_is_proposed(tmp_path: Path) -> None:
         open_recording(path)
 
 
+@pytest.mark.parametrize(
+    "times",
+    [
+        [1_714_564_800 * 10**9, 1_714_564_801 * 10**9],
+        ["2024-05-01 12:00:00Z", "2024-05-01 12:00:01Z"],
+        pd.to_datetime(["2024-05-01 14:00:00+02:00", "2024-05-01 14:00:01+02:00"]),
+        pd.to_timedelta([1_714_564_800, 1_714_564_801], unit="s"),
+    ],
+    ids=["ns", "text", "zone", "differences"],
+)
+def test_times_of_a_data_frame_are_proposed_as_they_are(tmp_path: Path, times: Any) -> None:
+    """An index of dates was left out, whole ns were taken for s, and the first column for the time."""
+    frame = pd.DataFrame({"gz": [1.0, 2.0], "AccX": [0.0, 0.0], "AccY": 0.0, "AccZ": 1.0})
+    if isinstance(times, list):
+        frame["timestamp"] = times
+    else:
+        frame.index = times
+    frame.to_parquet(path := tmp_path / "drive.parquet")
+    with pytest.raises(DataError) as refused:
+        open_recording(path)
+    (tmp_path / "drive.parquet.columns.yaml").write_text(str(refused.value).split(".columns.yaml: ")[1])
+    recording = open_recording(path)
+    assert recording.start_ns == 1_714_564_800 * 10**9
+    assert recording.imu is not None
+    assert np.diff(recording.imu.t_ns).tolist() == [10**9]
+    assert recording.imu.accel_mps2[0, 2] == pytest.approx(9.80665)
+
+
 def test_damaged_parquet(tmp_path: Path) -> None:
     path = parquet(tmp_path, {"t": [0.0], "wz": [1.0]})
     whole = path.read_bytes()

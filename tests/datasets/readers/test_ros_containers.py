@@ -255,6 +255,13 @@ def test_unknown_types_elsewhere_do_no_harm(tmp_path: Path) -> None:
     assert len(imu) == 400
 
 
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_a_file_of_messages_packed_one_by_one_asks_for_its_folder(tmp_path: Path, kind: str) -> None:
+    folder = make(tmp_path, f"folder {kind} MESSAGE")
+    with pytest.raises(DataError, match="packed one by one; give the folder of the bag"):
+        open_recording(folder / f"a.{kind}")
+
+
 def test_messages_of_other_encodings_are_named(tmp_path: Path) -> None:
     from mcap.writer import Writer
 

@@ -247,6 +247,7 @@ def test_one_driven_axle_is_two_sides(names: list[str]) -> None:
         ("panther/fl_wheel_joint", "front_left"), ("farmbot/left_wheel_joint", "left"),
         ("swarm_1/left_wheel", "left"), ("company_left_wheel", "left"), ("arm_left_wheel", None),
         ("left_arm_joint", None), ("left_arm1_joint", None), ("arms_left", None), ("pan_left", None),
+        ("LH_WHEEL", "rear_left"), ("rh", "rear_right"),
         ("leftFlipper", None), ("caster_left_wheel", None), ("front_left_steering_wheel", None),
     ],
 )  # fmt: skip
@@ -264,6 +265,22 @@ def test_joints_without_speed_until_the_hardware_answers(tmp_path: Path) -> None
     assert wheels is not None
     assert len(wheels) == len(TIMES) - 1
     np.testing.assert_array_equal(wheels.speed, np.tile([6.0, 6.5], (len(wheels), 1)))
+
+
+def test_velocities_that_are_zero_while_the_angles_turn_are_differences_of_these(tmp_path: Path) -> None:
+    """A driver that fills the field with zeros: the wheels were found dead, and left out."""
+    names = [*NAMES, "left_wheel_2_joint"]
+    joints = [
+        ("/joint_states", JOINTS, t, MAKE2.joints(t, names, [0.1 * k, 0.2 * k, 0.0], [0.0, 0.0, 0.0]))
+        for k, t in enumerate(TIMES)
+    ]
+    found = open_recording(write_ros2(tmp_path / "bag", imu_messages(MAKE2, n=300) + joints))
+    assert found.wheels is not None
+    rates = np.array([[0.1, 0.2]]) / (np.diff(TIMES)[:, None] * 1e-9)
+    np.testing.assert_allclose(found.wheels.speed, rates)
+    noted = " ".join(found.notes)
+    assert "all velocities of /joint_states are zero, though its angles turn" in noted
+    assert "; not used: left_wheel_2_joint" in noted
 
 
 @pytest.fixture

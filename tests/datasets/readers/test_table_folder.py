@@ -102,3 +102,24 @@ def test_a_replay_of_a_folder_of_tables(tmp_path: Path, terrafusion: Terrafusion
     )
     assert terrafusion("replay", log, "--mode", "fixed", "--out", tmp_path / "out").status == 0
     assert (tmp_path / "out" / "metrics.json").is_file()
+
+
+def test_parts_of_one_drive_are_to_be_appended(tmp_path: Path) -> None:
+    (log := tmp_path / "drive").mkdir()
+    for k in range(3):
+        (log / f"run_{k:02d}.csv").write_text(f"t,wz\n{k}.0,0.1\n{k}.5,0.2\n")
+    advice = r"if they are parts of one drive, append them: `cat run_\*.csv > drive.csv`"
+    with pytest.raises(DataError, match=f"give one of its logs itself: run_00.csv, .*; {advice}"):
+        open_recording(log)
+    for k in range(3):
+        (log / f"run_{k:02d}.csv.columns.yaml").write_text(
+            "{time: {column: t, epoch: none}, channels: {imu: {gyro_z_radps: wz}}}"
+        )
+    with pytest.raises(DataError, match=f"run_00.csv and run_01.csv both have it; .*; {advice}"):
+        open_recording(log)
+    whole = "".join((log / f"run_{k:02d}.csv").read_text() for k in range(3))
+    (tmp_path / "drive.csv").write_text(whole)
+    (log / "run_00.csv.columns.yaml").rename(tmp_path / "drive.csv.columns.yaml")
+    imu = open_recording(tmp_path / "drive.csv").imu
+    assert imu is not None
+    assert imu.t_ns.tolist() == [k * 500_000_000 for k in range(6)]

@@ -254,6 +254,30 @@ def test_exports_of_autopilots_and_phones_are_proposed(case: str, tmp_path: Path
     assert expected in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("first", "step", "entry"),
+    [
+        (987_654_321_012, 33_333_333, "unit: ns, epoch: none"),
+        (5_000 * 10**9, 33_333_333, "unit: ns, epoch: none"),
+        (5_000 * 10**6, 33_333, "unit: us, epoch: none"),
+        (432_000_000, 10, "unit: ms, epoch: none"),
+        (1_704_067_200, 1, "unit: s, epoch: unix"),
+        (1_704_067_200_000, 20, "unit: ms, epoch: unix"),
+    ],
+)
+def test_times_since_the_computer_was_started_are_no_dates(first: int, step: int, entry: str) -> None:
+    """5000 s in ns were taken for ms in 2128, and rows to be nine hours apart."""
+    times = [first + k * step for k in range(20)]
+    assert entry in starter_map(["t", "gz"], [str(first), "0"], sample=lambda name: times)
+
+
+def test_a_table_without_times_says_which_column_is_taken_for_them(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no name is a time's: does 'row' hold seconds"):
+        open_recording(table(tmp_path, "row,gz\n0,1\n1,1\n", None))
+    recording = proposed(tmp_path, "gz,when\n1,2024-05-01 12:00:00\n1,2024-05-01 12:00:01\n")
+    assert recording.start_ns == 1_714_564_800 * 10**9
+
+
 def test_a_sigma_of_the_height_that_is_not_given_is_twice_the_horizontal_one(tmp_path: Path) -> None:
     recording = proposed(tmp_path, "t,lat,lon,alt,hAcc\n0,48,11,500,0.5\n1,48,11,500,0.7\n")
     assert recording.gnss is not None

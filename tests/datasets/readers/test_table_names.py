@@ -14,6 +14,8 @@ from tests.datasets.readers.test_table_headers import proposed
     ("names", "fields"),
     [
         ("Track Speed Left (rpm),Track Speed Right (rpm)", ["left_radps", "right_radps"]),
+        ("WhlSpdFL,WhlSpdFR,ws_rl,wheelspeed_rr", ["rear_left_mps", "rear_right_mps"]),
+        ("LF,RF,LH,RH", ["rear_left_mps", "rear_right_mps"]),
         ("odo_speed,forward_velocity", ["speed_mps"]),
         ("x_utm,y_utm", ["east_m", "north_m"]),
         ("E,N", ["east_m", "north_m"]),
@@ -23,10 +25,16 @@ from tests.datasets.readers.test_table_headers import proposed
 )
 def test_names_of_tracks_odometers_and_map_grids_are_proposed(names: str, fields: list[str]) -> None:
     proposal = starter_map(["t", "gz", *names.split(",")])
-    found = [
-        name for name in ("left_radps", "right_radps", "speed_mps", "east_m", "north_m") if name in proposal
-    ]
-    assert found == fields
+    known = (
+        "rear_left_mps",
+        "rear_right_mps",
+        " left_radps",
+        " right_radps",
+        "speed_mps",
+        "east_m",
+        "north_m",
+    )
+    assert [name.strip() for name in known if name in proposal.replace("{", " ")] == fields
 
 
 def test_words_of_a_fix_type_are_not_proposed_as_codes() -> None:

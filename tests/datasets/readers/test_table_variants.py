@@ -252,6 +252,20 @@ def test_ticks_of_each_row_that_are_taken_for_angles_are_noted(tmp_path: Path) -
         open_recording(tmp_path / "drive.csv")
 
 
+def test_ticks_of_each_row_that_rows_hold_are_counted_once(tmp_path: Path) -> None:
+    """A table at the rate of the IMU holds them for three rows: the robot drove three times as far."""
+    ticks = [8 + k % 7 for k in range(60)]
+    rows = "".join(f"{k / 30:.3f},{ticks[k // 3]},{ticks[k // 3] + 1}\n" for k in range(180))
+    recording = opened_as_proposed(tmp_path, f"t,d_left_ticks,d_right_ticks\n{rows}")
+    assert "wheels: increments stay for 3 rows: if these hold them, add held: {wheels: 3}" in recording.notes
+    columns = tmp_path / "drive.csv.columns.yaml"
+    columns.write_text(columns.read_text().replace("{time", "{held: {wheels: 3}, time", 1))
+    wheels = open_recording(tmp_path / "drive.csv").wheels
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    np.testing.assert_allclose(np.diff(wheels.angle_rad[:, 0]), 2.0 * np.pi / 1024 * np.array(ticks[2:]))
+
+
 @pytest.mark.parametrize("names", ["ecef_x,ecef_y,ecef_z", "ecefX [cm],ecefY [cm],ecefZ [cm]", "x,y,z"])
 def test_earth_centred_positions_are_fixes(names: str, tmp_path: Path) -> None:
     """Of a table of x, y, z they were the truth of a robot 6 000 km from its origin."""

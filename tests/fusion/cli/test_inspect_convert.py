@@ -66,7 +66,7 @@ def test_options_that_a_log_folder_has_no_use_for_are_warned_of(
     warned = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert warned == [
         f"warning: {log}: topics only matter for ROS bags; not used here",
-        f"warning: {log}: columns only matter for plain tables; not used here",
+        f"warning: {log}: columns only matter for plain tables and bags; not used here",
     ]
     _, _, err = run(capsys, *words)
     assert "warning" not in err
