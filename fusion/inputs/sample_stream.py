@@ -19,6 +19,8 @@ MOST_LATE_S = 5.0
 LONGEST_WAIT_S = 0.5
 SILENT_NS = 2_000_000_000
 """A stream that another one is so far ahead of is silent (assumed)."""
+MOST_WAITING = 10_000
+"""So many samples wait for an IMU or wheels that do not come (100 s of the fastest; assumed)."""
 BLOCK = 256
 """Old samples are dropped so many at a time, so that it stays cheap."""
 
