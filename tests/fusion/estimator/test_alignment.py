@@ -196,6 +196,12 @@ def test_a_start_that_is_none_is_refused(bad: dict[str, float]) -> None:
         Estimator.for_vehicle("elevate").set_start(np.zeros(3), **bad)
 
 
+def test_a_start_in_degrees_is_refused() -> None:
+    with pytest.raises(DataError, match="yaw 90 rad of the start is more than a turn; give radians"):
+        Estimator.for_vehicle("elevate").set_start(np.zeros(3), 90.0)
+    Estimator.for_vehicle("elevate").set_start(np.zeros(3), 1.5 * np.pi)
+
+
 RATE_RADPS = 0.02
 """What the gyro below tells at rest."""
 
