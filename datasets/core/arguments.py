@@ -31,6 +31,17 @@ def checked_whole(value: Any, what: str, least: int = 0) -> int:
     return int(value)
 
 
+def checked_progress(value: Any) -> Any:
+    """A function to call as work goes on, or None.
+
+    Raises:
+        ConfigError: anything else.
+    """
+    if value is None or callable(value):
+        return value
+    raise ConfigError(f"'progress' is {value!r}", remedy="give a function to call, or None")
+
+
 def checked_path(value: Any, what: str) -> Path:
     """A file or folder to write.
 

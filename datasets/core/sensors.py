@@ -223,7 +223,7 @@ def assumed_sigma(
     spec, flat = rig.sensors.gnss if rig else None, CLASS_SIGMA_M[fix]
     best = CLASS_SIGMA_M[fix if every is None else every].min()
     if spec is None or spec.sigma_horizontal_m > COARSER * best:
-        return _by_class(flat), f"assumed by class, flat: {_classes(fix)}"
+        return _by_class(flat), f"their class (assumed, flat): {_classes(fix)}"
     poorer = flat > best
     own = np.array([spec.sigma_horizontal_m] * 2 + [spec.sigma_vertical_m])
     origin = f"the vehicle's receiver, {spec.sigma_horizontal_m:g} m flat"

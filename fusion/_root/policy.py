@@ -7,7 +7,7 @@ policy = terrafusion.policy.fit("policy.yaml", seeds=3)  # from drives of the tw
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from terrafusion.datasets.core.arguments import checked_path, checked_whole
+from terrafusion.datasets.core.arguments import checked_path, checked_progress, checked_whole
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 from terrafusion.fusion.noise.policy import load_policy as load
 
@@ -43,6 +43,7 @@ def fit(
 
     file = checked_path(out, "out")
     checked_whole(seeds, "seeds", 1)
+    checked_progress(progress)
     logged = read_logs([str(log) for log in logs], vehicle) if logs else LoggedSamples()
     fitted = fit_policy(default_grid(seeds, tuple(GROUNDS), vehicle), progress or (lambda: None), logged)
     write_policy(fitted, file, made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from terrafusion.datasets.core.arguments import checked_path
+from terrafusion.datasets.core.arguments import checked_path, checked_progress
 from terrafusion.datasets.readers.logs import Log, opened
 from terrafusion.fusion.outputs.robot_file import write_robot
 from terrafusion.fusion.sensor_calibration import SensorCalibration
@@ -37,6 +37,7 @@ def calibrate_sensors(
     Raises:
         TerrafusionError: no log has fixes, or a log or the vehicle cannot be used.
     """
+    checked_progress(progress)
     known = None if vehicle is None else as_vehicle(vehicle)
     return LearnedSensors(
         **vars(run(opened(logs, None if known is None else known.rig()), vehicle, progress=progress))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 
-from terrafusion.datasets.core.arguments import checked_names, checked_path, checked_whole
+from terrafusion.datasets.core.arguments import checked_names, checked_path, checked_progress, checked_whole
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
@@ -73,6 +73,7 @@ def diagnose(
         DataError: a log without what the diagnosis needs, or given twice.
     """
     seed = checked_whole(seed, "seed")
+    checked_progress(progress)
     if not isinstance(significance, Real):
         raise ConfigError(f"'significance' is {significance!r}", remedy="give a number from 0.001 to 0.5")
     rig = None if vehicle is None else as_vehicle(vehicle).rig()

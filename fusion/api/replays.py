@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.arguments import checked_path
+from terrafusion.datasets.core.arguments import checked_path, checked_progress
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.tables import text_html
 from terrafusion.datasets.readers.logs import Log, opened
@@ -98,6 +98,7 @@ def replay(
         >>> result.metrics["mode"]
         'adaptive'
     """
+    checked_progress(progress)
     known = None if vehicle is None else as_vehicle(vehicle)
     if not (grounds is None or isinstance(grounds, (str, Path, GroundMemory))):
         raise ConfigError(f"grounds is {grounds!r}", remedy="give a file, or the `grounds` of a result")

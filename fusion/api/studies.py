@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from terrafusion.datasets.core.arguments import checked_names, checked_path, checked_whole
+from terrafusion.datasets.core.arguments import checked_names, checked_path, checked_progress, checked_whole
 from terrafusion.twin.sweep.load import load_sweep
 from terrafusion.twin.sweep.plan import Sweep
 from terrafusion.twin.sweep.run import run_sweep
@@ -40,6 +40,7 @@ def sweep(
         TerrafusionError: a package is missing, workers died, or the folder cannot be written.
     """
     out = checked_path(out, "out")
+    checked_progress(progress)
     loaded = plan if isinstance(plan, Sweep) else load_sweep(plan)
     table = run_sweep(
         loaded, out, jobs=checked_whole(jobs, "jobs", 1), backend=backend, address=address, progress=progress
@@ -84,6 +85,7 @@ def benchmark(
     from terrafusion.fusion.reports.benchmark import at_the_end, origin_of, write_benchmark
 
     out = checked_path(out, "out")
+    checked_progress(progress)
     seeds = None if seeds is None else checked_whole(seeds, "seeds", 1)
     plan = BenchmarkPlan(families_of(checked_names(only, "only")), seeds, quick)
     origin = origin_of(plan, "terrafusion.benchmark")

@@ -24,7 +24,7 @@ STATUS = {
     "running": "position, heading and slip are estimated",
     "outage": "no GNSS fix for more than two seconds; wheels and IMU carry the position",
     "doubtful": "fixes contradict wheels and gyro; sigma spans what is possible, the notes tell why",
-    "stalled": "IMU samples do not come, or are not used, while those of the wheels do: the state is old, or "
+    "stalled": "IMU samples do not come, or are not used, as when clocks were set back: the state is old, or "
     "after some seconds that of the wheels alone",
     "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }

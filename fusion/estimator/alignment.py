@@ -24,8 +24,8 @@ LEVEL_SIGMA_STILL_RAD, LEVEL_SIGMA_MOVING_RAD = 0.02, 0.05
 UNSEEN_BIAS_SIGMA_RADPS = 0.004
 """Least prior of the gyro's bias where the robot did not stand at the start: data sheets and drivers promise
 less than is found (0.0035 rad/s on a Husky whose driver removes it at rest)."""
-LEAST_SIGMA, MOST_YAW_RAD = 1e-6, 100.0
-"""Of a given start: sigma in m or rad, and a heading, which more than degrees exceed."""
+LEAST_SIGMA, MOST_YAW_RAD = 1e-6, 2.0 * np.pi
+"""Of a given start: sigma in m or rad, and a heading, which most degrees exceed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ def checked_start(
     """A given start.
 
     Raises:
-        DataError: not three finite coordinates and a finite heading with positive sigmas.
+        DataError: not three finite coordinates and a heading within a turn, with positive sigmas.
     """
     position = as_numbers(position_m, "start", "start")
     yaw_rad, position_sigma_m, yaw_sigma_rad = (
@@ -155,11 +155,14 @@ def checked_start(
             f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
             remedy="give 1 sigma",
         )
-    far_m = max(*np.abs(position[:2]).tolist(), position_sigma_m)
-    if far_m > MOST_AWAY_M or abs(position[2]) > MOST_HEIGHT_M or abs(yaw_rad) > MOST_YAW_RAD:
+    if abs(yaw_rad) > MOST_YAW_RAD:
         raise DataError(
-            f"start at {position.tolist()} m with yaw {yaw_rad:g} lies beyond the earth",
-            remedy="give metres east and north, and radians",
+            f"yaw {yaw_rad:g} rad of the start is more than a turn", remedy="give radians, 0 to the east"
+        )
+    far_m = max(*np.abs(position[:2]).tolist(), position_sigma_m)
+    if far_m > MOST_AWAY_M or abs(position[2]) > MOST_HEIGHT_M:
+        raise DataError(
+            f"start at {position.tolist()} m lies beyond the earth", remedy="give metres east and north"
         )
     sigma_m, sigma_rad = max(position_sigma_m, LEAST_SIGMA), max(min(yaw_sigma_rad, np.pi), LEAST_SIGMA)
     return KnownStart(position, yaw_rad, sigma_m, sigma_rad)

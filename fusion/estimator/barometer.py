@@ -68,7 +68,7 @@ class BarometerAiding(BiasedSensor[float]):
         """One pressure; impossible values are rejected."""
         low, high = Barometer.POSSIBLE_PA
         if low <= pressure_pa <= high:
-            self._samples.append((int(t_ns), float(pressure_pa)))
+            self._hold(int(t_ns), float(pressure_pa))
         else:
             self.refused += 1
 

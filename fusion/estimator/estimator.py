@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from terrafusion.datasets.core.arrays import Array, Stamp
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import ImuSample, Message
+from terrafusion.datasets.core.messages import Message
 from terrafusion.datasets.core.printable import counted
 from terrafusion.datasets.core.robot import SKIDDING
 from terrafusion.datasets.core.tables import text_html
@@ -37,7 +37,7 @@ from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.keyframe_motion import KeyframeMotion, MotionInput
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.mean_motion import MeanMotion
-from terrafusion.fusion.estimator.messages import arguments_of
+from terrafusion.fusion.estimator.messages import arguments_of, count_left_out
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
 from terrafusion.fusion.estimator.place_doubt import PlaceDoubt
@@ -147,8 +147,7 @@ class Estimator:
     def add(self, message: Message) -> None:
         """One message of `Recording.messages()` or of a driver; see `messages.arguments_of`."""
         if (read := arguments_of(message, self.config)) is None:
-            if isinstance(message, ImuSample) and self.config.inputs.imu == "six_axis":
-                self.imu.leave_out(message.gyro_radps)
+            count_left_out(message, self.config, self.imu, self.weights)
             return
         method, arguments = read
         getattr(self, method)(message.t_ns, *arguments)

@@ -27,6 +27,7 @@ from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, DRIFT, SLIP, VELOCITY
+from terrafusion.fusion.inputs.sample_stream import MOST_WAITING
 from terrafusion.fusion.inputs.validation import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import Weighting
@@ -107,6 +108,9 @@ class GnssUpdater:
         self.waiting.append(fix)
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
+        if len(self.waiting) > MOST_WAITING:
+            del self.waiting[0]
+            self.too_late += 1
 
     def correct(self, t_ns: int, antenna_m: Array, delay_s: float) -> None:
         """Correct the lever arm, body x and y (2,), from `t_ns` on, and the lateness of the stamps."""

@@ -156,7 +156,7 @@ class MagnetometerAiding(BiasedSensor[Array]):
         if field.shape != (3,):
             raise DataError(f"a field of shape {field.shape}", channel="magnetometer", remedy="give x, y, z")
         if not self.disabled and np.isfinite(field).all():
-            self._samples.append((int(t_ns), field))
+            self._hold(int(t_ns), field)
 
     @property
     def ready(self) -> bool:

@@ -23,9 +23,10 @@ from terrafusion.datasets.core.messages import (
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.steering import front_ratio
-from terrafusion.fusion.inputs.streams import DECLARE
+from terrafusion.fusion.inputs.streams import DECLARE, ImuStream
 from terrafusion.fusion.inputs.validation import as_number, as_numbers
 from terrafusion.fusion.terrain.external import TRUE_SOURCES, known_probabilities
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
 
 Arguments = tuple[Any, ...]
 
@@ -49,6 +50,14 @@ def arguments_of(message: Message, config: EstimatorConfig) -> tuple[str, Argume
             remedy="give what Recording.messages() yields, or call add_imu, add_wheels, add_gnss",
         )
     return None
+
+
+def count_left_out(message: Message, config: EstimatorConfig, imu: ImuStream, weights: TerrainNoise) -> None:
+    """Count a message of which `arguments_of` makes nothing, where its source should have given more."""
+    if isinstance(message, ImuSample) and config.inputs.imu == "six_axis":
+        imu.leave_out(message.gyro_radps)
+    elif isinstance(message, TerrainSample) and message.source not in TRUE_SOURCES:
+        weights.left_out += 1
 
 
 def _imu(message: ImuSample, config: EstimatorConfig) -> Arguments | None:

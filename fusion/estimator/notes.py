@@ -101,6 +101,11 @@ def _on_samples(estimator: Estimator) -> list[str]:
             f"{counted(left_out, 'sample')} of imu left out: an axis is missing, or all forces are 0, as "
             "of a driver that has lost its sensor"
         )
+    if left_out := estimator.weights.left_out:
+        notes.append(
+            f"{counted(left_out, 'sample')} of terrain left out: without probabilities, or with ones that "
+            "are missing, negative or all 0"
+        )
     if estimator.wheels.noise.out_of_step:
         notes.append(
             "wheels: the counters are read out of step with their stamps; distances follow the speeds, and "

@@ -27,6 +27,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.inputs.sample_stream import MOST_WAITING
 
 T = TypeVar("T")
 
@@ -135,6 +136,12 @@ class BiasedSensor(ABC, Generic[T]):
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a time."""
         self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
+
+    def _hold(self, t_ns: int, value: T) -> None:
+        """Hold a sample until a keyframe has passed it."""
+        self._samples.append((t_ns, value))
+        if len(self._samples) > MOST_WAITING:
+            self._samples.popleft()
 
     def _due(self, t_ns: int, newest_ns: int, most_age_ns: int) -> list[tuple[int, T]]:
         """Take the samples up to `t_ns`, and give those that are not too old."""

@@ -19,6 +19,8 @@ MOST_LATE_S = 5.0
 LONGEST_WAIT_S = 0.5
 SILENT_NS = 2_000_000_000
 """A stream that another one is so far ahead of is silent (assumed)."""
+MOST_WAITING = 10_000
+"""So many samples wait for an IMU or wheels that do not come (100 s of the fastest; assumed)."""
 BLOCK = 256
 """Old samples are dropped so many at a time, so that it stays cheap."""
 
@@ -34,6 +36,12 @@ class SetBack:
     late_ns: int
     others_ns: int
     count: int = 1
+
+    @property
+    def is_clock(self) -> bool:
+        """Whether they show a clock that was set back: no messages are late like that."""
+        long = self.last_ns - self.first_ns >= CONFIRMED_NS
+        return self.late_ns > JUMP_NS and self.count >= CONFIRMED and long
 
 
 class Lateness:
@@ -102,13 +110,13 @@ class Lateness:
         return bisect.bisect_right(times, t_ns)
 
     def _watch_clock(self, t_ns: int, late_ns: int) -> None:
-        """Raise where samples go on in order, far behind the newest: no messages are late like that."""
+        """Raise where samples go on in order, far behind the newest."""
         newest_ns, run = self.jump.newest.t_ns or t_ns, self.back
         if run is None or t_ns < run.last_ns:
             self.back = SetBack(t_ns, t_ns, late_ns, newest_ns)
             return
         run.last_ns, run.count = t_ns, run.count + 1
-        if run.late_ns <= JUMP_NS or run.count < CONFIRMED or t_ns - run.first_ns < CONFIRMED_NS:
+        if not run.is_clock:
             return
         what = f"sample at {t_ns} ns: its clock was set back by {run.late_ns * 1e-9:.1f} s"
         if newest_ns - run.others_ns > CONFIRMED_NS // 2:
@@ -153,9 +161,11 @@ class SampleStream:
 
     @property
     def stalled(self) -> bool:
-        """Whether its samples do not come, or are not used, while those of another stream do."""
-        jump = self.late.jump
-        return jump.refuted_ns is not None or (jump.newest.t_ns or 0) - self.t_ns[-1] > SILENT_NS
+        """Whether its samples do not come while those of another stream do, or are not used."""
+        newest, back = self.late.jump.newest, self.late.back
+        refused = self.late.jump.refuted_ns is not None or (back is not None and back.is_clock)
+        behind_ns = (newest.t_ns or 0) - self.t_ns[-1]
+        return refused or max(behind_ns, newest.fixes_alone_ns()) > SILENT_NS
 
     def covers(self, t_ns: int) -> bool:
         """Whether a keyframe at `t_ns` need not wait for samples."""

@@ -5,7 +5,7 @@ import math
 
 from terrafusion.datasets.core.arrays import Stamp
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.inputs.sample_stream import SampleStream
+from terrafusion.fusion.inputs.sample_stream import MOST_WAITING, SampleStream
 from terrafusion.fusion.inputs.time_jumps import Newest
 from terrafusion.fusion.inputs.validation import as_number, checked_time
 
@@ -50,6 +50,8 @@ class SteeringStream(SampleStream):
                 self.t_ns.insert(i, at_ns)
                 self.per_m.insert(i, per_m)
                 self.course.insert(i, course)
+        if len(self.t_ns) > MOST_WAITING:
+            self.forget(self.t_ns[-MOST_WAITING // 2])
 
     def curvature_per_m(self, start_ns: int, end_ns: int) -> float | None:
         """Mean curvature between two times, 1/m; None where no angle is near."""

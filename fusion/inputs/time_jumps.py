@@ -48,6 +48,7 @@ class Newest:
         steps_ns: the last steps of time.
         used_count: number of samples that are used.
         fixes_ns: times of the last fixes, as they came; `fix_count` counts all.
+        alone_ns: time of the first fix since the last sample that is used; None where none has come.
     """
 
     t_ns: int | None = None
@@ -56,10 +57,12 @@ class Newest:
     used_count: int = 0
     fixes_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
     fix_count: int = 0
+    alone_ns: int | None = None
 
     def advance(self, t_ns: int) -> None:
         """Take the time of a sample that is used."""
         self.used_count += 1
+        self.alone_ns = None
         if self.t_ns is None or t_ns > self.t_ns:
             if self.t_ns is not None:
                 self.steps_ns.append(t_ns - self.t_ns)
@@ -82,6 +85,11 @@ class Newest:
         """Take the time of a fix, whether it is used or not."""
         self.fixes_ns.append(t_ns)
         self.fix_count += 1
+        self.alone_ns = t_ns if self.alone_ns is None else self.alone_ns
+
+    def fixes_alone_ns(self) -> int:
+        """Time over which fixes alone have come, by their stamps; 0 before two of them."""
+        return 0 if self.alone_ns is None else self.fixes_ns[-1] - self.alone_ns
 
     def fix_wait_ns(self) -> int:
         """Time within which another fix shows whether time has jumped; 0 where it does not."""

@@ -33,6 +33,8 @@ BELIEVED = 0.5
 """Credit from which the label, and not the detector, is taken for the ground."""
 STANDING_NS = 2_000_000_000
 """A robot that stands sees the same ground in all pictures: those of so long count as evidence (assumed)."""
+ROUNDING = 0.01
+"""By so much probabilities may miss 1, as rounded ones do (assumed)."""
 MOST_CHANGES = 1000
 """Records kept where nobody takes them: memory must not grow over days."""
 
@@ -60,6 +62,7 @@ class TerrainNoise:
         changes: what changed since `take_changes` was last called, the newest `MOST_CHANGES` of it.
         window: the newest window that the detector was given.
         found_ground: the found ground that the robot is on, "" on a class or on new ground.
+        left_out: number of messages of another source that held no probabilities.
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
@@ -98,6 +101,7 @@ class TerrainNoise:
         self._last_speed = np.nan
         self._source = "detector"
         self._external_ns: int | None = None
+        self.left_out = 0
         self._seen_standing_ns = 0
 
     def learn_slip(self, mean: float, sigma: float, time_s: float, t_ns: int) -> None:
@@ -199,7 +203,7 @@ class TerrainNoise:
         return np.asarray(self._claimed + (1.0 - self.detector.credit.value) * (found - self._claimed))
 
     def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
-        """Fuse the class probabilities of another source.
+        """Fuse the class probabilities of another source; what is missing to 1 is that of `unknown`.
 
         Raises:
             DataError: a class the policy does not know, or numbers that are no probabilities.
@@ -216,13 +220,16 @@ class TerrainNoise:
                 remedy=f"the policy knows {', '.join(self.detector.classes)}",
             )
         given = [probabilities.get(name, 0.0) for name in self.detector.classes]
+        q = as_numbers(given, "probabilities", "terrain")
+        if 0.0 < (total := float(q.sum())) < 1.0 - ROUNDING:
+            q[self._unknown] += 1.0 - total
         since_ns = UPDATE_NS if self._external_ns is None else min(abs(t_ns - self._external_ns), UPDATE_NS)
         if self.window is not None and self.window.ground_speed_mps() < STANDS:
             since_ns = min(since_ns, STANDING_NS - self._seen_standing_ns)
             self._seen_standing_ns += since_ns
         else:
             self._seen_standing_ns = 0
-        self.detector.fuse(as_numbers(given, "probabilities", "terrain"), since_ns / UPDATE_NS)
+        self.detector.fuse(q, since_ns / UPDATE_NS)
         self._external_ns = t_ns
         self._source = "external source"
         self._reweight(t_ns)

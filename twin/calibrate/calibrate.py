@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafusion.datasets.core.arguments import checked_names
+from terrafusion.datasets.core.arguments import checked_names, checked_progress
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.quantity import Quantity, checked_number
@@ -97,6 +97,7 @@ def calibrate(
     if not recordings:
         raise DataError("no log was given", remedy="give at least one")
     check_source(source)
+    checked_progress(progress)
     wanted = None if channels is None else checked_channels(checked_names(channels, "channels"))
     given = {
         "window_s": window_s, "slope_deg": slope_deg, "aspect_deg": aspect_deg, "payload_kg": payload_kg,

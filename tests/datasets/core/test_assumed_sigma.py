@@ -44,5 +44,5 @@ def test_fixes_better_than_the_receiver_have_the_sigma_of_their_class() -> None:
     """A vehicle file that extends 'generic' says 1.5 m, of a stand-alone receiver; the log has RTK."""
     sigma, note = horizontal_m([Fix.FIXED, Fix.SINGLE], vehicle="generic")
     assert sigma == pytest.approx([0.02, 3.0])
-    assert note.endswith("taken from assumed by class, flat: single 3 m, fixed 0.02 m")
+    assert note.endswith("taken from their class (assumed, flat): single 3 m, fixed 0.02 m")
     assert horizontal_m([Fix.SINGLE], vehicle="generic")[0] == pytest.approx([1.5])

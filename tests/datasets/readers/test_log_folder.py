@@ -351,7 +351,7 @@ def test_sigmas_that_are_missing_are_those_of_the_class(tmp_path: Path, header: 
     recording = open_recording(folder)
     assert recording.gnss is not None
     assert recording.gnss.sigma_enu_m[:, :2].tolist() == [[3.0, 3.0], [0.02, 0.02]]
-    assert any("gnss: 2 fixes have no sigma; taken from assumed by class" in note for note in recording.notes)
+    assert any("gnss: 2 fixes have no sigma; taken from their class" in note for note in recording.notes)
     own = open_recording(folder, rig=load_vehicle("husky").rig())
     assert own.gnss is not None
     assert own.gnss.sigma_enu_m[:, 0].tolist() == [3.0, 0.02]  # its stand-alone receiver made no RTK fix

@@ -277,7 +277,7 @@ def test_fixes_without_a_covariance_have_the_sigma_of_their_class(
     )
     assert recording.gnss is not None
     assert recording.gnss.sigma_enu_m.tolist() == [list(sigma_m)]
-    assert "1 fixes have no sigma; taken from assumed by class" in notes_of(recording)
+    assert "1 fixes have no sigma; taken from their class" in notes_of(recording)
 
 
 def stamped(stamps: list[int], topic: str = "/imu") -> list[Message]:

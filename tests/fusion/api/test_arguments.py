@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -155,6 +156,21 @@ def test_counts_and_names_are_of_their_types(log: tf.Recording, tmp_path: Path) 
     for call, wrong, message in calls:
         with pytest.raises(tf.ConfigError, match=message):
             call(log, **wrong)
+
+
+def test_progress_is_a_function(log: tf.Recording, tmp_path: Path) -> None:
+    calls: list[Callable[..., object]] = [
+        lambda **wrong: tf.replay(log, **wrong),
+        lambda **wrong: tf.calibrate_sensors(log, **wrong),
+        lambda **wrong: tf.calibrate(log, **wrong),
+        lambda **wrong: tf.diagnose(log, **wrong),
+        lambda **wrong: tf.sweep("friction_slope", tmp_path, **wrong),
+        lambda **wrong: tf.benchmark(tmp_path, **wrong),
+        lambda **wrong: tf.policy.fit(tmp_path / "policy.yaml", **wrong),
+    ]
+    for call in calls:
+        with pytest.raises(tf.ConfigError, match="'progress' is True; give a function to call"):
+            call(progress=True)
 
 
 def test_a_prior_is_no_number(log: tf.Recording) -> None:

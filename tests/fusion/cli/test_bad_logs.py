@@ -275,7 +275,7 @@ def test_fixes_without_sigma_have_that_of_their_class(good_log: Path, tmp_path: 
     """An empty cell is a missing value, no error: the fixes are used, and what is assumed is said."""
     shutil.copytree(good_log, tmp_path / "log")
     cells("gnss.csv", "sigma_n_m", "", ALL)(tmp_path / "log")
-    assert "131 fixes have no sigma; taken from assumed by class" in terrafusion("inspect", "log").out
+    assert "131 fixes have no sigma; taken from their class" in terrafusion("inspect", "log").out
     outcome = terrafusion("replay", "log", "--out", "results")
     assert (outcome.status, outcome.err) == (0, "")
     assert "no usable GNSS fix" not in outcome.out

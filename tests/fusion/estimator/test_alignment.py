@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -195,6 +196,12 @@ def test_a_start_that_is_none_is_refused(bad: dict[str, float]) -> None:
         Estimator.for_vehicle("elevate").set_start(np.zeros(3), **bad)
 
 
+def test_a_start_in_degrees_is_refused() -> None:
+    with pytest.raises(DataError, match="yaw 90 rad of the start is more than a turn; give radians"):
+        Estimator.for_vehicle("elevate").set_start(np.zeros(3), 90.0)
+    Estimator.for_vehicle("elevate").set_start(np.zeros(3), 1.5 * np.pi)
+
+
 RATE_RADPS = 0.02
 """What the gyro below tells at rest."""
 
@@ -294,3 +301,22 @@ def test_an_imu_that_falls_silent_stalls_the_estimator() -> None:
         if t_ns < 3_000_000_000:
             estimator.add_imu(t_ns, np.zeros(3), [0.0, 0.0, 9.81])
         assert (estimator.status == "stalled") == (t_ns > 4_980_000_000)
+
+
+@pytest.mark.parametrize("back_s", [None, 3600, 3])
+def test_a_clock_set_back_or_fixes_alone_stall_the_estimator(back_s: int | None) -> None:
+    estimator = Estimator.for_vehicle("elevate")
+    estimator.set_start(np.zeros(3), 0.0)
+    for t_ns in range(3600 * 10**9, 3612 * 10**9, 20_000_000):
+        after = t_ns >= 3604 * 10**9
+        stamp_ns = t_ns - (back_s or 0) * 10**9 * after
+        if t_ns % 10**9 == 0:
+            estimator.add_gnss(t_ns, np.zeros(3), 0.02)
+        if back_s is not None or not after:
+            with contextlib.suppress(DataError):
+                estimator.add_wheels(stamp_ns, 0.0, 0.0)
+            with contextlib.suppress(DataError):
+                estimator.add_imu(stamp_ns, np.zeros(3), [0.0, 0.0, 9.81])
+        began_s, ended_s = (3607, 3612) if back_s is None else (3605, 3607 if back_s == 3 else 3612)
+        if t_ns % 10**9 == 0 and t_ns > 3601 * 10**9:
+            assert (estimator.status == "stalled") == (began_s * 10**9 <= t_ns < ended_s * 10**9), t_ns

@@ -55,6 +55,19 @@ def test_a_fix_that_comes_twice_counts_once(husky: Estimator) -> None:
     assert [fix.t_ns for fix in husky.gnss.waiting] == [10**9, 2 * 10**9]
 
 
+def test_what_waits_for_imu_and_wheels_that_do_not_come_is_bounded(husky: Estimator) -> None:
+    for t_ns in range(10**9, 10**9 + 10_050 * 10**7, 10**7):
+        husky.add_gnss(t_ns, np.array([1e-9 * t_ns, 0.0, 0.0]), 0.02)
+        husky.add_steering(t_ns, 0.0)
+        husky.add_pressure(t_ns, 1e5)
+        husky.add_magnetic_field(t_ns, [2e-5, 0.0, -4e-5])
+    aids, waiting = husky.aids, husky.gnss.waiting
+    held = [waiting, husky.steering.t_ns, aids.height._samples, aids.heading._samples]
+    assert all(1_000 < len(samples) <= 10_000 for samples in held)
+    assert waiting[-1].t_ns == t_ns
+    assert husky.gnss.too_late == 50
+
+
 def test_a_fix_without_a_sigma_has_that_of_its_class(husky: Estimator) -> None:
     husky.add(GnssSample(10**9, np.zeros(3), np.full(3, np.nan), 4, None, float("nan")))
     (fix,) = husky.gnss.waiting

@@ -23,6 +23,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.inputs.streams import MOST_INCOMPLETE
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.simulate import simulate
@@ -124,6 +125,16 @@ def test_lists_will_do_and_odd_probabilities_are_none() -> None:
     estimator.add(TerrainSample(0, "mud", "camera", {"mud": None}))  # type: ignore[dict-item]
     estimator.add(SteeringSample(0, None, ("front",)))  # type: ignore[arg-type]
     assert len(estimator.imu.t_ns) == len(estimator.wheels.t_ns) == 1
+
+
+def test_what_a_camera_gives_without_probabilities_is_counted() -> None:
+    estimator = Estimator.for_vehicle("elevate")
+    for source, given in (
+        ("camera", None), ("camera", {}), ("camera", {"mud": np.nan}), ("camera", {"mud": 0.9}),
+        ("annotation", None), ("simulation", {"mud": 1.0}),
+    ):  # fmt: skip
+        estimator.add(TerrainSample(10**9, "mud", source, given))
+    assert any("3 samples of terrain left out: without prob" in note for note in notes_of(estimator))
 
 
 @pytest.mark.parametrize(

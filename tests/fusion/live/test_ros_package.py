@@ -5,10 +5,15 @@ from __future__ import annotations
 import ast
 import inspect
 import json
+import runpy
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
+import pytest
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
@@ -66,6 +71,48 @@ def test_the_node_calls_what_the_library_has() -> None:
     assert used["receive"] == len(inspect.signature(LiveNode.receive).parameters) - 1
 
 
+@pytest.mark.parametrize("vehicle", ["husky", "no_robot"])
+def test_a_terminated_node_keeps_what_it_learned_and_one_without_a_vehicle_says_so(
+    monkeypatch: pytest.MonkeyPatch, vehicle: str
+) -> None:
+    """In place of rclpy: a signal shuts the context down, then `spin` raises and publishers do."""
+    rclpy, closed = MagicMock(), list[str]()
+    rclpy.executors.ExternalShutdownException = type("Shutdown", (Exception,), {})
+    rclpy.spin.side_effect = rclpy.executors.ExternalShutdownException
+
+    class Node:
+        def __init__(self, name: str) -> None:
+            self.context, self.create_publisher = MagicMock(), MagicMock()
+            self.context.ok.return_value = False
+            self.create_publisher.return_value.publish.side_effect = RuntimeError("context is invalid")
+            self.get_logger = self.create_timer = self.create_service = self.destroy_node = MagicMock()
+
+        def declare_parameter(self, name: str, value: Any) -> Any:
+            return SimpleNamespace(value=vehicle if name == "vehicle" else value)
+
+        def get_parameter(self, name: str) -> Any:
+            return SimpleNamespace(value=[0.0])
+
+    def close(live: LiveNode) -> None:
+        live._publish("/odometry", TYPES["/odometry"], b"")
+        closed.append("saved")
+
+    rclpy.node.Node = Node
+    for name in ("rclpy", "rclpy.executors", "rclpy.node", "rclpy.qos"):
+        monkeypatch.setitem(sys.modules, name, getattr(rclpy, name.removeprefix("rclpy."), rclpy))
+    for name in ("rosidl_runtime_py", "rosidl_runtime_py.utilities", "std_srvs", "std_srvs.srv"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+    monkeypatch.setattr(LiveNode, "close", close)
+    main = runpy.run_path(str(PACKAGE / "terrafusion_ros" / "node.py"))["main"]
+    if vehicle == "husky":
+        main()
+    else:
+        with pytest.raises(SystemExit, match="no_robot"):
+            main()
+    assert closed == (["saved"] if vehicle == "husky" else [])
+
+
 def test_the_launch_file_starts_the_node_of_the_package() -> None:
     launch = ast.parse((PACKAGE / "launch" / "terrafusion.launch.py").read_text(encoding="utf-8"))
     (node,) = [c for c in ast.walk(launch) if isinstance(c, ast.Call) and ast.unparse(c.func) == "Node"]
@@ -100,8 +147,6 @@ def test_the_foxglove_layout_shows_topics_that_are_published() -> None:
 
 def test_foxglove_gets_what_is_published() -> None:
     import socket
-
-    import pytest
 
     pytest.importorskip("foxglove")
     from terrafusion.fusion.live.foxglove import FoxgloveView

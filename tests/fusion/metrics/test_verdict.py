@@ -435,7 +435,7 @@ def test_wild_fixes_that_were_rejected_do_not_count_as_agreement(drive):
 )
 def test_a_sigma_that_was_assumed_far_too_large_is_asked_for(drive, nis, reported, asked):
     d = drive(offset_m=(0.1, 0.1), sigma_m=0.2)
-    notes = () if reported else ("gnss: 100 fixes have no sigma; taken from assumed by class",)
+    notes = () if reported else ("gnss: 100 fixes have no sigma; taken from their class",)
     d = dataclasses.replace(d, recording=dataclasses.replace(d.recording, notes=notes))
     found = verdict(d, estimate=with_innovations(d, np.full(100, 2.0 * nis)))
     assert any("gnss_sigma_m" in reason for reason in found.reasons) == asked

@@ -189,6 +189,19 @@ def test_probabilities_that_are_none_are_refused(given: object, said: str) -> No
     assert weights.posterior() == before
 
 
+def test_what_probabilities_miss_to_one_is_unknown_ground() -> None:
+    """A camera that gave mud 5 % and nothing else was taken to be certain of it."""
+    partial, whole, rounded, sure = (noise_of() for _ in range(4))
+    for k in range(5):
+        partial.external(k * 500_000_000, {"mud": 0.05})
+        whole.external(k * 500_000_000, {"mud": 0.05, "unknown": 0.95})
+        rounded.external(k * 500_000_000, {"mud": 0.992})
+        sure.external(k * 500_000_000, {"mud": 1.0})
+    assert partial.posterior() == whole.posterior()
+    assert partial.posterior()["mud"] < 0.05
+    assert rounded.posterior() == sure.posterior()
+
+
 def test_the_window_of_the_detector_is_that_of_the_last_second() -> None:
     """Wheels on a circle: 1.0 and 1.5 m/s on a track of 0.55 m."""
     seen = list[Window]()

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosidl_runtime_py.utilities import get_message
@@ -53,8 +54,9 @@ class TerrafusionNode(Node):
         return (values[0], values[1], values[2]) if len(values) == 3 else None
 
     def send(self, topic: str, msgtype: str, cdr: bytes) -> None:
-        """Publish a serialised message."""
-        self.publishers_of[topic].publish(cdr)
+        """Publish a serialised message; after a signal, which shuts rclpy down at once, no more."""
+        if self.context.ok():
+            self.publishers_of[topic].publish(cdr)
 
     def discover(self) -> None:
         """Subscribe to what the estimator can use."""
@@ -105,13 +107,17 @@ class TerrafusionNode(Node):
 
 
 def main() -> None:
-    """Run the node until it is interrupted."""
+    """Run the node until it is interrupted or terminated."""
     rclpy.init()
-    node = TerrafusionNode()
+    try:
+        node = TerrafusionNode()
+    except TerrafusionError as error:
+        raise SystemExit(str(error)) from None
     try:
         rclpy.spin(node)
-    except KeyboardInterrupt:
-        node.live.close()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     finally:
+        node.live.close()
         node.destroy_node()
         rclpy.try_shutdown()
