@@ -77,11 +77,13 @@ class GapVerdict:
 
     def withheld_on_unseen_drives(self, significant: bool = True, sure: bool = False) -> Self:
         """On drives unlike the references', or patchier ground: undecided where no effect explains the gap
-        well, as it may come from these, or where the test is not `significant` at a stricter threshold. An
-        unknown cause stands where it is `sure` that there is one."""
+        well, as it may come from these, or where the test is not `significant` at a stricter threshold. Where
+        it is `sure` that there is a gap, its cause is unknown instead."""
         explained = self.kind != "unknown" and self.log_odds >= 0.0 and (self.left or 0.0) <= MOST_LEFT
         if (significant and explained) or (sure and self.kind == "unknown"):
             return self
+        if sure and self.kind != "no_gap":
+            return self.refuted()
         return self.undecided()
 
     def undecided(self) -> Self:
@@ -90,8 +92,8 @@ class GapVerdict:
         return dataclasses.replace(self, kind="no_gap", named=(), sets=loose, fit=None)
 
     def refuted(self) -> Self:
-        """An unknown cause, where the twin with the named effects is as far from the runs as without: the
-        likelihood only compares effects, with noise as loud as the best of them leaves."""
+        """An unknown cause, where the twin with the named effects is nearly as far from the runs as without:
+        the likelihood only compares effects, with noise as loud as the best of them leaves."""
         share, p_effect = 1.0 - CREDIBLE, 1.0 - self.p_null - self.p_unknown
         causes = [dataclasses.replace(c, probability=share * c.probability) for c in self.causes]
         sets = [dataclasses.replace(s, probability=share * s.probability, named=False) for s in self.sets]

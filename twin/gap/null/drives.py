@@ -2,7 +2,7 @@
 
 References teach errors of the twin, scatter of the ground and noise for the drives that they made. The time
 of the judged runs is counted by cell of commanded speed, turn rate and acceleration; a cell is covered where
-the references spent at least a second in it, or as long as the judged runs. Cells are shares of the speed and
+the references spent at least a second in it, or as long as any judged run. Cells are shares of the speed and
 turn rate that the references reach: half the speed is another drive for a slow robot, too.
 """
 
@@ -81,10 +81,10 @@ def drive_coverage(
 def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverage:
     """Coverage of commanded twists (N, 2) each, by those of references."""
     widths = cell_widths(references)
-    known, judged = (
-        sum((by_cell(twist, widths) for twist in some), Samples()) for some in (references, runs)
-    )
-    lacking = {cell: n for cell, n in judged.items() if known[cell] < min(LEAST_S / DT_S, n)}
+    taught, own = ([by_cell(twist, widths) for twist in some] for some in (references, runs))
+    known, judged = (sum(some, Samples()) for some in (taught, own))
+    longest = {cell: max(run[cell] for run in own) for cell in judged}
+    lacking = {cell: n for cell, n in judged.items() if known[cell] < min(LEAST_S / DT_S, longest[cell])}
     words = Counter[str]()
     for cell, n in lacking.items():
         words[_words(cell, widths)] += n

@@ -113,7 +113,16 @@ def test_on_unseen_drives_an_unknown_cause_stands_where_the_gap_is_sure() -> Non
     effect = verdict({("mass",): 600.0}, left={("mass",): 0.7})
     assert unknown.withheld_on_unseen_drives().kind == "no_gap"
     assert unknown.withheld_on_unseen_drives(sure=True).kind == "unknown"
-    assert effect.withheld_on_unseen_drives(sure=True).kind == "no_gap"
+    assert effect.withheld_on_unseen_drives().kind == "no_gap"
+
+
+def test_on_unseen_drives_a_sure_gap_that_its_effect_hardly_explains_is_of_unknown_cause() -> None:
+    """Stronger ground in another simulator was no gap at p = 2e-6: a mass that left 69 % of it."""
+    effect = verdict({("mass",): 600.0}, left={("mass",): 0.7})
+    after = effect.withheld_on_unseen_drives(sure=True)
+    assert (after.kind, after.named, after.fit) == ("unknown", (), None)
+    none = verdict({("mass",): 3.0}, detection=Detection(4.0, 0.017), sigma=3.0)
+    assert none.kind == none.withheld_on_unseen_drives(sure=True).kind == "no_gap"  # of about no size
 
 
 @pytest.mark.parametrize(

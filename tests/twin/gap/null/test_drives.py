@@ -20,6 +20,12 @@ def test_the_same_drive_is_covered() -> None:
     assert found.missing == ()
 
 
+def test_one_reference_covers_several_runs_of_its_own_drive() -> None:
+    """It spends less than a second in each part, and less there than both runs together."""
+    drive = np.concatenate([steady(0.3 * k, 0.0, 0.8) for k in range(1, 6)])
+    assert coverage([drive, drive], [drive]).covered == pytest.approx(1.0)
+
+
 def test_what_references_never_drove_is_named_with_its_time() -> None:
     judged = np.concatenate([steady(0.6, 0.0, 30.0), steady(1.2, -0.6, 10.0)])
     found = coverage([judged], [steady(0.6, 0.0, 60.0)])
