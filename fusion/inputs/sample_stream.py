@@ -19,6 +19,8 @@ MOST_LATE_S = 5.0
 LONGEST_WAIT_S = 0.5
 SILENT_NS = 2_000_000_000
 """A stream that another one is so far ahead of is silent (assumed)."""
+MANY, LEAST_SPAN_NS = 1000, 50_000_000
+"""So many samples last for longer: no sensor has 20 kHz (assumed), but times in microseconds look so."""
 MOST_WAITING = 10_000
 """So many samples wait for an IMU or wheels that do not come (100 s of the fastest; assumed)."""
 BLOCK = 256
@@ -152,8 +154,16 @@ class SampleStream:
         dropped.
 
         Raises:
-            DataError: the sample is so old that the clock must have jumped.
+            DataError: the sample is so old that the clock must have jumped, or the first ones span no time.
         """
+        if self.late.used_ns is None and len(self.t_ns) >= MANY:
+            span_ns = max(t_ns, self.t_ns[-1]) - self.t_ns[-MANY]
+            if span_ns < LEAST_SPAN_NS:
+                raise DataError(
+                    f"sample at {t_ns} ns is the last of {MANY + 1} within {span_ns * 1e-6:.3g} ms",
+                    channel=self.late.channel,
+                    remedy="give times in nanoseconds, not in us, ms or s; it is left out",
+                )
         if wrong := self.late.from_future(t_ns, self.t_ns):
             for column in self._columns():
                 del column[-wrong:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import GnssSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import until
@@ -66,6 +67,18 @@ def test_what_waits_for_imu_and_wheels_that_do_not_come_is_bounded(husky: Estima
     assert all(1_000 < len(samples) <= 10_000 for samples in held)
     assert waiting[-1].t_ns == t_ns
     assert husky.gnss.too_late == 50
+
+
+@pytest.mark.parametrize("per_s", [1, 1_000, 1_000_000])
+def test_times_that_are_no_nanoseconds_are_refused(husky: Estimator, per_s: int) -> None:
+    """The estimator waited for ever, and held all samples."""
+    for k in range(1000):
+        husky.add_imu(k * per_s // 100, np.zeros(3), GRAVITY)
+    for k in range(1000, 2000):
+        with pytest.raises(DataError, match="give times in nanoseconds"):
+            husky.add_imu(k * per_s // 100, np.zeros(3), GRAVITY)
+    husky.add_imu(10**9, np.zeros(3), GRAVITY)  # a clock that stood still goes on
+    assert husky.imu.t_ns[-1] == 10**9
 
 
 def test_a_fix_without_a_sigma_has_that_of_its_class(husky: Estimator) -> None:
