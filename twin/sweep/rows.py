@@ -183,18 +183,21 @@ def _results(t_s: Array, twist: Array, states: Array, summary: RunSummary, vehic
         status = IMMOBILISED
     elif ratio is not None and ratio < MOBILE_RATIO:
         status = SLID if ratio < 0.0 else SPINNING
-    turned = float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]])
+    true, turned = float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]]), _odometry_yaw(states, vehicle)
     return dataclasses.asdict(summary) | {
         "status": status,
         "travel_m": travel,
         "travel_ratio": ratio,
-        "yaw_error_rad": _odometry_yaw(states, vehicle) - turned,
+        "yaw_error_rad": None if turned is None else turned - true,
     }
 
 
-def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float:
-    """Angle the robot turned by its wheels' angles, rad."""
-    left, right = (states[-1] - states[0])[state_slice("wheel_angle")].reshape(2, 2).mean(axis=0)
+def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float | None:
+    """Angle the robot turned by its wheels' angles, rad; None where all wheels are steered."""
+    if vehicle.drive.type == "four_wheel_steer":
+        return None
+    pairs = (states[-1] - states[0])[state_slice("wheel_angle")].reshape(2, 2)
+    left, right = pairs[1] if vehicle.drive.type == "ackermann" else pairs.mean(axis=0)
     return float(right - left) * vehicle.odometry.wheel_radius_m / vehicle.odometry.track_m
 
 
