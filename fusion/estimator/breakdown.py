@@ -47,8 +47,8 @@ def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
         try:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 advance(estimator, last)
-            state = estimator.latest()
-            if state is not before and not math.isfinite(state.covariance.sum() + sum(state.position_m)):
+            state = None if estimator.latest() is before else estimator.latest()
+            if state is not None and not math.isfinite(state.covariance.sum() + sum(state.position_m)):
                 raise ArithmeticError("a state is not finite")
         except CallbackError as passed:
             raise passed.error from None

@@ -282,10 +282,10 @@ class Estimator:
             if start is None:
                 return
             self._begin(start)
-        newest = self.chain.last
-        while (t_ns := self._due(last)) is not None:
+        chain, newest = self.chain, self.chain.last
+        while self.chain is chain and (t_ns := self._due(last)) is not None:
             self._keyframe(t_ns)
-        if self.chain.last == newest or last:
+        if self.chain is chain and (chain.last == newest or last):  # a callback may have reset it
             self._upkeep()
 
     def _due(self, last: bool = False) -> int | None:
@@ -337,12 +337,14 @@ class Estimator:
             stream.late.used_ns = t_ns
         preintegrated = not (planar or motion.in_gap or motion.in_pause)
         readings = mean.gyro_radps, mean.accel_mps2
-        k = self.chain.append(t_ns, point, link, markov, wheels, *readings, preintegrated)
+        chain = self.chain
+        k = chain.append(t_ns, point, link, markov, wheels, *readings, preintegrated)
         if planar:
-            self.chain.add(k, level_factor(k))
+            chain.add(k, level_factor(k))
         aided = not self.gnss.is_outage(t_ns)
-        self._stationarity.update(self.chain, link, self.imu, self.wheels, before, aided)
-        self._fresh = self._finish_keyframe(t_ns, mean.gyro_radps, motion.rolled_m), mean
+        self._stationarity.update(chain, link, self.imu, self.wheels, before, aided)
+        fresh = self._finish_keyframe(t_ns, mean.gyro_radps, motion.rolled_m), mean
+        self._fresh = fresh if self.chain is chain else None
 
     def _renewed_slip(self, t_ns: int) -> float:
         """Share of the ground that changed before a keyframe at `t_ns`; the slip of the window follows it."""

@@ -49,6 +49,27 @@ def test_a_state_belongs_to_the_caller(husky: Estimator) -> None:
     np.testing.assert_array_equal(key.linear, before[1])
 
 
+def test_a_caller_may_reset_it_on_a_state() -> None:
+    """Where the estimate is doubtful, say; the next keyframe was looked for in an empty graph."""
+    states: list[State] = []
+
+    def took(state: State) -> None:
+        states.append(state)
+        if len(states) == 40:
+            husky.reset()
+            husky.set_start([5.0, 0.0, 0.0], 0.0)
+
+    husky = Estimator(Estimator.for_vehicle("husky").config, on_state=took)
+    husky.set_start([0.0, 0.0, 0.0], 0.0)
+    for k in range(1000):
+        husky.add_wheels(k * 10**7, 1.0, 1.0)
+        husky.add_imu(k * 10**7, np.zeros(3), GRAVITY)
+    assert len(states) > 60
+    assert states[39].position_m[0] > 2.0
+    assert 5.0 < states[40].position_m[0] < 6.5  # after the second in which it aligns
+    husky.finish()
+
+
 def test_a_fix_that_comes_twice_counts_once(husky: Estimator) -> None:
     for _ in range(2):
         husky.add_gnss(10**9, np.zeros(3), 0.02)

@@ -166,11 +166,14 @@ def estimated(cause: dict[str, Any], injection: Injection) -> list[float] | None
 
 
 def cases(logs: Sequence[str]) -> Iterator[tuple[str, Injection | None, float, int]]:
-    """Set, change, severity and fold of every row: in each fold nothing, and changes in turn."""
+    """Set, change, severity and fold of every row: in each fold nothing, which comes first as it shows the
+    false alarms, and changes in turn."""
     changes = [(i, j) for i in range(len(INJECTIONS)) for j in range(len(SEVERITIES))]
     for name in logs:
         for fold in range(FOLDS):
             yield name, None, 0.0, fold
+    for name in logs:
+        for fold in range(FOLDS):
             for i, j in changes:
                 if (j - i) % FOLDS == fold:  # the severities of a change fall on different pieces
                     yield name, INJECTIONS[i], SEVERITIES[j], fold
