@@ -232,6 +232,7 @@ def test_sums_count_what_was_judged() -> None:
         row("gyro biased", 2.0, crash="ZeroDivisionError: x", right=False),
     ]
     lines = injections.sums(rows)
+    assert lines[0] == "Alarms on unchanged segments: 1 of 2 (0.09 to 0.91)"
     assert "| `x` | 1 of 2 | 3 | 1 | 1 | 1; 2 | GNSS late |" in lines
     gyro = next(line for line in lines if line.startswith("| gyro biased"))
     assert gyro == "| gyro biased (0.005 rad/s) | 0, 0, 0 of 0 | 1, 1, 1 of 2 | 0, 0, 0 of 1 | 0, 0, 0 of 0 |"
@@ -262,6 +263,14 @@ def test_a_stopped_table_goes_on_and_rows_of_other_candidates_do_not_count(
     assert counter.read_text() == "1 2 2 "
     injections.run(tmp_path, ["one"], ("mass",), one)
     assert counter.read_text() == "1 2 2 1 2 "
+
+
+def test_unchanged_segments_can_be_judged_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(injections, "run_all", lambda tasks, *_: asked.extend(task.name for task in tasks))
+    monkeypatch.setattr(injections, "SETS", {"one": None})
+    injections.run(tmp_path, ["one"], (), TaskWorkers(), unchanged=True)
+    assert asked == [f"one/None/0.0/{fold}" for fold in range(injections.FOLDS)]
 
 
 def test_what_a_log_cannot_show_is_said() -> None:

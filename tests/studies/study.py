@@ -38,9 +38,9 @@ class Study:
 
 
 READS_LOGS = (
-    "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
+    "good_logs", "survey", "field_table", "fault_injection", "field_nulls", "benchmark", "opponents",
     "ice_picture", "outage_terms", "known_changes", "grounds", "fault_matrix",
-    "coarse_slides", "course_lag", "own_grounds",
+    "coarse_slides", "course_lag", "own_grounds", "effective_track",
 )  # fmt: skip
 
 

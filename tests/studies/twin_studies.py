@@ -127,6 +127,14 @@ TWIN = (
         spread=True,
     ),
     Study(
+        "field_nulls",
+        "Does the diagnosis alarm on real logs that nothing was done to?",
+        module("fault_injection.table", "--out", OUT, "--unchanged"),
+        6,
+        {"alarms": r"Alarms on unchanged segments: (.*)"},
+        spread=True,
+    ),
+    Study(
         "effective_track",
         "Which track do wheels and gyro of a skid-steered robot imply on each ground?",
         module("effective_track", f"{DATA}/husky_parkinglot/test1.bag", "--vehicle", "husky"),

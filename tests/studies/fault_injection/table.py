@@ -26,6 +26,7 @@ from terrafusion.datasets.core.files import check_folder
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.segments import segment, segment_spans
 from terrafusion.datasets.readers import open_recordings
+from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
@@ -214,24 +215,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--suspects", action="store_true", help="only sensors, wheels and ground, see SUSPECTS"
     )
+    parser.add_argument("--unchanged", action="store_true", help="no changes: false alarms alone")
     parser.add_argument("--sum", action="store_true", help="run nothing: sums of the answers that are there")
     add_options(parser)
     given = parser.parse_args(arguments)
     workers = None if given.sum else TaskWorkers.of(given)
     try:
-        run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else (), workers)
+        effects = SUSPECTS if given.suspects else ()
+        run(given.out, given.set or sorted(SETS), effects, workers, unchanged=given.unchanged)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def run(out: Path, sets: Sequence[str], effects: Sequence[str], workers: TaskWorkers | None) -> None:
+def run(
+    out: Path,
+    sets: Sequence[str],
+    effects: Sequence[str],
+    workers: TaskWorkers | None,
+    unchanged: bool = False,
+) -> None:
     """The table of some sets, written to `out`; rows of other sources or effects are made anew.
 
     Args:
         effects: to choose from; none for the whole catalogue.
         workers: None to run nothing.
+        unchanged: judge segments as they are alone.
 
     Raises:
         TerrafusionError: a log is not at hand or cannot be read, or the folder cannot be written.
@@ -240,6 +250,8 @@ def run(out: Path, sets: Sequence[str], effects: Sequence[str], workers: TaskWor
     code = f"{model_sha256()} {' '.join(effects)}"
     tasks = []
     for name, injection, severity, fold in cases(sets):
+        if unchanged and injection is not None:
+            continue
         change = None if injection is None else INJECTIONS.index(injection)
         what = (name, change, severity, fold, tuple(effects) or None)
         tasks.append(Task("/".join(map(str, what[:4])), code, what))
@@ -279,7 +291,12 @@ def table(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def sums(rows: Sequence[dict[str, Any]]) -> list[str]:
     """By set, then by change with a column a severity: Markdown tables."""
+    nulls = [row for row in rows if row["change"] == "unchanged" and "skipped" not in row]
+    alarms = Rate(sum(not row["right"] for row in nulls), len(nulls))
+    low, high = alarms.interval()
     lines = [
+        f"Alarms on unchanged segments: {alarms.hits} of {alarms.count} ({low:.2f} to {high:.2f})",
+        "",
         "| logs | unchanged: alarms | changes | seen | right | change first; of three | no channel for |",
         "|" + " --- |" * 7,
     ]
@@ -288,10 +305,10 @@ def sums(rows: Sequence[dict[str, Any]]) -> list[str]:
         missing = dict.fromkeys(row["change"] for row in mine if "skipped" in row)
         told = [row for row in mine if "skipped" not in row]
         still, judged = ([r for r in told if (r["change"] == "unchanged") == same] for same in (True, False))
-        alarms = f"{sum(not r['right'] for r in still)} of {len(still)}"
+        false = f"{sum(not r['right'] for r in still)} of {len(still)}"
         first = f"{_ranked(judged, 1)}; {_ranked(judged, 3)}"
         right = sum(r["right"] for r in judged)
-        counts = [alarms, len(judged), sum(map(_seen, judged)), right, first, ", ".join(missing)]
+        counts = [false, len(judged), sum(map(_seen, judged)), right, first, ", ".join(missing)]
         lines.append("| " + " | ".join([f"`{name}`", *map(str, counts)]) + " |")
     changed = [row for row in rows if row["change"] != "unchanged" and "skipped" not in row]
     heads = [f"severity {severity:g}: seen, first, right" for severity in SEVERITIES]
