@@ -115,9 +115,15 @@ def _findings(context: CheckContext) -> list[Finding]:
         units = [finding for check in UNIT_CHECKS for finding in check(context) if finding.code in UNIT_CODES]
         explained = {finding.channel for finding in units}
         findings = units + [finding for finding in findings if finding.channel not in explained]
-    found = [CONSEQUENCES.get((finding.code, finding.channel), set[str]()) for finding in findings]
+    found = [_consequences(finding) for finding in findings]
     findings = [finding for finding in findings if not any(finding.code in codes for codes in found)]
     return sorted(findings, key=lambda finding: finding.severity != "error")
+
+
+def _consequences(finding: Finding) -> set[str]:
+    """Codes that a finding may bring about: times that are a little off, a warning, make no robot stand."""
+    small = finding.code == "clock-offset" and finding.severity != "error"
+    return set() if small else CONSEQUENCES.get((finding.code, finding.channel), set())
 
 
 def _may_be_units(recording: Recording, impossible: list[Finding]) -> bool:

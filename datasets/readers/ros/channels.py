@@ -273,7 +273,7 @@ class ChannelBuilder:
             keep, speed = speeds_of(t_ns, angle)
             angle, t_ns = angle[keep], t_ns[keep]
             self.notes.append(
-                f"wheels: {stream.topic} tells no velocities; taken from differences of the angles"
+                f"wheels: {stream.topic} has no usable velocities; taken from differences of the angles"
             )
         if speed is None:
             raise DataError("joints have neither velocity nor position", channel=stream.topic)

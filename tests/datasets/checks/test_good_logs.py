@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import terrafusion as tf
-from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.checks import repair, run, run_checks
+from terrafusion.datasets.checks.finding import Finding
 from terrafusion.datasets.checks.scale import _keeps_moving
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
@@ -308,6 +309,17 @@ def test_fixes_half_a_minute_late_do_not_show_a_standing_robot() -> None:
     codes = {finding.code for finding in run_checks(dataclasses.replace(log, gnss=late), rig(log))}
     assert "clock-offset" in codes
     assert not codes & {"standing", "carried"}
+
+
+@pytest.mark.parametrize(("severity", "left"), [("error", 1), ("warning", 2)])
+def test_only_a_wrong_clock_explains_a_standing_robot(
+    monkeypatch: pytest.MonkeyPatch, severity: str, left: int
+) -> None:
+    """Fixes are often late by tenths of a second: wheels that spin in place are named beside that."""
+    late = Finding("clock-offset", severity, "gnss", "late", "", "")
+    spinning = Finding("standing", "warning", "wheels", "rolls in place", "", "")
+    monkeypatch.setattr(run, "CHECKS", (lambda _: [late, spinning],))
+    assert len(run_checks(LOGS["simulated"]())) == left
 
 
 def test_fixes_that_end_within_a_window_show_no_standing_robot() -> None:
